@@ -36,7 +36,6 @@ LONG_CLASSES = {
     "Run": 320,
     "RunViewer": 290,
     "SerialBridge": 300,
-    "Updater": 290,
     "_Inspector": 270,
 }
 

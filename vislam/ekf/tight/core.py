@@ -19,10 +19,11 @@ from vislam.ekf.sensor_rows import OwnVariables, Sensing
 from vislam.ekf.stretch import Stretch
 from vislam.ekf.tight import kernels
 from vislam.ekf.tight.kernels import INERTIAL, Inertial
+from vislam.ekf.tight.known import KnownUpdater
 from vislam.ekf.tight.own_variables import begun, corrected_by_reading
 from vislam.ekf.tight.state import CLONES, MOUNT, TIME, Window, propagated
 from vislam.ekf.tight.tracks import FrameTracks
-from vislam.ekf.tight.update import Updater
+from vislam.ekf.tight.update import FrameUpdater
 from vislam.imu import ImuNoise
 from vislam.sensors import Suite
 
@@ -112,7 +113,7 @@ class TightCore:
         self._config = config
         self._gravity = gravity_m_s2
         self._told_sigmas = imu_sigmas(config, noise)
-        self._updater = Updater(config, noise, gravity_m_s2, rig)
+        self._frames, self._known = FrameUpdater(config, gravity_m_s2, rig), KnownUpdater(config, noise)
         self.R_configured = np.ascontiguousarray(rig.T_body_cams[0][:3, :3], dtype=np.float64)
 
     def blank(self) -> TightState:
@@ -183,9 +184,9 @@ class TightCore:
         window = propagated(state.window, state.inertial.Phi, state.inertial.Q)
         state.inertial = _since_now(state.x)
         if isinstance(what, FrameTracks):
-            window, outcome = self._updater.see(window, state.x, gyro_rad_s, ago_s, what)
+            window, outcome = self._frames.see(window, state.x, gyro_rad_s, ago_s, what)
         elif isinstance(what, AtRest):
-            window, outcome = self._updater.rest(window, state.x, gyro_rad_s, event.t_ns)
+            window, outcome = self._known.rest(window, state.x, gyro_rad_s, event.t_ns)
         elif isinstance(what, NoiseScale):
             window, outcome = replace(window, noise=what), Outcome(True, counts={"noise_changes": 1})
             state.sigmas = scaled(self._told_sigmas, what)
@@ -194,7 +195,7 @@ class TightCore:
         elif isinstance(what, OwnStart):
             window, outcome = begun(self.sensing, window, what, event.t_ns)
         else:
-            window, outcome = self._updater.known_bias(window, state.x, what.values)
+            window, outcome = self._known.known_bias(window, state.x, what.values)
         offset_s = min(max(window.time_offset_s, -_MAX_OFFSET_S), _MAX_OFFSET_S)
         state.window = replace(window, time_offset_s=offset_s)
         return outcome

@@ -1,4 +1,4 @@
-"""What a frame, a moment of rest and a known bias do to the tight filter. Settings only; the state comes and goes."""
+"""What a frame does to the tight filter. Settings only; the state comes and goes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from numpy.typing import NDArray
 
 from vislam.config import EkfConfig
 from vislam.core.chi_square import chi_square_limit
-from vislam.core.geometry import invert, skew, so3_log
+from vislam.core.geometry import invert, skew
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.ekf.filter_core import (
     RESET_REJECTS,
     RESET_S,
     REST_PAUSE_NS,
-    REST_SIGMA_DEG,
-    REST_SIGMA_M,
-    ZERO_RATE_SIGMA_RAD_S,
-    ZERO_VELOCITY_SIGMA_M_S,
     reset_sigmas,
 )
 from vislam.ekf.history import Outcome
@@ -28,12 +24,9 @@ from vislam.ekf.loose.kernels import pose
 from vislam.ekf.tight import features
 from vislam.ekf.tight.kernels import from_nav_error
 from vislam.ekf.tight.state import (
-    CLONES,
-    Rest,
     Window,
     cloned,
     compressed,
-    corrected,
     depth_ratios,
     gain_step,
     moved,
@@ -42,7 +35,6 @@ from vislam.ekf.tight.state import (
     without_points,
 )
 from vislam.ekf.tight.tracks import FrameTracks, image_motion_px, marked, ripe_tracks, seen_at
-from vislam.imu import ImuNoise
 
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
@@ -93,10 +85,10 @@ class _Rows:
     H_points: Array  # [K, 3, 3]
 
 
-class Updater:
-    """Applies measurements: the same one on the same state gives the same answer, however often it is replayed."""
+class FrameUpdater:
+    """Applies frames: the same one on the same state gives the same answer, however often it is replayed."""
 
-    def __init__(self, config: EkfConfig, noise: ImuNoise, gravity_m_s2: float, rig: Rig) -> None:
+    def __init__(self, config: EkfConfig, gravity_m_s2: float, rig: Rig) -> None:
         """Take the settings and the rig."""
         self._config = config
         self._gravity = gravity_m_s2
@@ -117,10 +109,7 @@ class Updater:
         self._least = 2 if rig.is_stereo or rig.has_depth else _MIN_OBSERVATIONS
         most = features.ROWS_MAX * (config.tight_clones + 2)
         self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
-        self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
         self._reset_sigmas = reset_sigmas()
-
-    # -- a frame -----------------------------------------------------------------------------------------------------
 
     def see(
         self, window: Window, x: Array, gyro_rad_s: Array, ago_s: float, frame: FrameTracks
@@ -301,75 +290,6 @@ class Updater:
         # points that no longer fit would only contradict again
         fresh = replace(window, P=P, rejects=0)
         return without_points(fresh, np.ones(len(window.point_ids), dtype=np.bool_))
-
-    # -- rest and biases ---------------------------------------------------------------------------------------------
-
-    def rest(self, window: Window, x: Array, gyro_rad_s: Array, t_ns: int) -> tuple[Window, Outcome]:
-        """Use that the body is at rest: no velocity, the gyro shows its bias, the pose is that where rest began."""
-        out = Outcome()
-        R = pose(x, 0, 6)[:3, :3]
-        H = np.zeros((6, len(window.P)))
-        H[:3, 6:9] = R.T / ZERO_VELOCITY_SIGMA_M_S
-        rate_sigma = max(ZERO_RATE_SIGMA_RAD_S, self._white_rate_sigma * window.noise.gyro)
-        H[3:, 9:12] = np.eye(3) / rate_sigma
-        r = np.concatenate((-R.T @ x[3:6] / ZERO_VELOCITY_SIGMA_M_S, (gyro_rad_s - x[13:16]) / rate_sigma))
-        if not self._passes("zero_velocity", window, H, r, out):
-            return replace(window, rest=None), out
-        window = replace(corrected(window, x, H, r), rested_t_ns=t_ns, watch=window.watch.seen(t_ns))
-        stamps = [frame.t_ns for frame in window.frames]
-        if window.rest is not None and window.rest.t_ns in stamps:
-            window = self._hold(window, x, stamps.index(window.rest.t_ns), out)
-        elif t_ns in stamps:
-            R = pose(x, 0, 6)[:3, :3]
-            window = replace(window, rest=Rest(t_ns, R, np.eye(3)))
-        if window.rest is not None:
-            to_first = np.ascontiguousarray(window.rest.R @ pose(x, 0, 6)[:3, :3].T)
-            window = replace(window, rest=replace(window.rest, to_first=to_first))
-        return window, out
-
-    def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
-        sigmas = np.repeat([np.deg2rad(REST_SIGMA_DEG), REST_SIGMA_M], 3)
-        T = pose(x, 0, 6)
-        H = np.zeros((6, len(window.P)))
-        at = CLONES + 6 * index
-        here = np.eye(6)
-        here[3:, :3] = -skew(window.p[index])
-        H[:, :6] = here / sigmas[:, None]
-        H[:, at : at + 6] = -here / sigmas[:, None]
-        turned = so3_log(window.R[index] @ np.ascontiguousarray(T[:3, :3].T))
-        r = np.concatenate((turned, window.p[index] - T[:3, 3])) / sigmas
-        if not self._passes("hold", window, H, r, out):
-            return replace(window, rest=None)
-        return corrected(window, x, H, r)
-
-    def _passes(self, kind: str, window: Window, H: Array, r: Array, out: Outcome) -> bool:
-        S = H @ window.P @ H.T + np.eye(len(r))
-        nis = float(r @ np.linalg.solve(S, r))
-        accepted = nis <= self._limits[len(r)]
-        out.count(f"{kind}_{'accepted' if accepted else 'gated'}")
-        if np.isnan(out.nis):
-            out.accepted, out.nis = accepted, nis
-        if accepted:
-            out.test(kind, 1, nis, len(r))
-        else:
-            out.reason = f"innovation {nis:.1f} of at most {self._limits[len(r)]:.1f}"
-        return accepted
-
-    def known_bias(self, window: Window, x: Array, bias: Array) -> tuple[Window, Outcome]:
-        """Take biases [12] (gyro, accel, their sigmas) found elsewhere; only the biases move (Schmidt-Kalman)."""
-        out = Outcome()
-        H = np.zeros((6, len(window.P)))
-        H[:, 9:15] = np.diag(1.0 / bias[6:])
-        r = np.concatenate((bias[:3] - x[13:16], bias[3:6] - x[10:13])) / bias[6:]
-        if not self._passes("bias", window, H, r, out):
-            return window, out
-        HP = H @ window.P
-        S = HP @ H.T + np.eye(6)
-        K = np.zeros((len(window.P), 6))
-        K[9:15] = np.linalg.solve(S, HP[:, 9:15]).T
-        KHP = K @ HP
-        P = window.P - KHP - KHP.T + K @ S @ K.T
-        return moved(replace(window, P=0.5 * (P + P.T)), x, K @ r), out
 
 
 def _is_small(before: Window, after: Window, change: Array) -> bool:
