@@ -2,14 +2,13 @@
 
 import pytest
 
-from vislam.config import load
+from vislam.config import MachineConfig, load
 from vislam.core.messages import NoiseScale, no_observations
 from vislam.ekf.filtering import Filtering
 from vislam.frontend.result import identity_motion
 from vislam.imu import SeenNoise
 from worlds.flight import MONO
 from worlds.motion import EUROC_NOISE, NS
-from worlds.parts import GRAVITY_M_S2
 
 FRAME_NS = NS // 20
 
@@ -19,7 +18,7 @@ class HeardNoise(Filtering):
 
     def __init__(self, coupling):
         config = load(None, {"ekf.coupling": coupling}).ekf
-        super().__init__(config, EUROC_NOISE, GRAVITY_M_S2, MONO)
+        super().__init__(config, EUROC_NOISE, MachineConfig(), MONO)
         self.since_ns = []
         follow = self.ekf.follow_noise
         self.ekf.follow_noise = lambda t_ns, scale: self.since_ns.append(t_ns) or follow(t_ns, scale)
