@@ -89,7 +89,7 @@ def test_real_recordings_go_on_through_steps_of_exposure(data_root: Path, name: 
     for frame in (e for e in real.events() if isinstance(e, Frame)):
         begun_ns = frame.t_ns if begun_ns is None else begun_ns
         seconds = (frame.t_ns - begun_ns) * 1e-9
-        if seconds > 9.0:
+        if seconds > 6.0:
             break
         result = front_end.track(stepped(frame, _STEPS[int(seconds / 1.5) % 4]), None)
         lost += result.vo.tracking is Tracking.LOST and "no depth has" not in result.reason
