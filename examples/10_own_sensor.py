@@ -2,7 +2,7 @@
 
     python examples/10_own_sensor.py
 
-A class says what a reading is and how sure it is; vislam derives the rest. docs/your-sensor.md goes through it.
+A class says what a reading is and how sure it is; vislam derives the rest. docs/extend.md goes through it.
 """
 
 import heapq

@@ -29,7 +29,7 @@ def test_the_files_of_sensors_on_the_page_are_such() -> None:
     assert suites[0] == ("gnss", "uwb", "wheels", "baro")
 
 
-@pytest.mark.parametrize("page", ["more-sensors.md", "your-sensor.md"])
+@pytest.mark.parametrize("page", ["more-sensors.md", "extend.md"])
 def test_the_code_on_a_page_runs(page: str) -> None:
     blocks = [block for language, block in BLOCK.findall((DOCS / page).read_text("utf-8")) if language == "python"]
     assert blocks

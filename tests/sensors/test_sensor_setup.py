@@ -16,7 +16,7 @@ from vislam.core.errors import UsageError, VislamError
 from vislam.core.messages import Array
 from vislam.sensors import BodyState, Configured, kind_class, load_sensor_setup, register
 from vislam.sensors.kinds import AnchorRange, Wheels
-from vislam.sensors.registry import _BUILT_IN, _KINDS
+from vislam.sensors.registry import _BUILT_IN, KINDS
 from vislam.sensors.toml import sensor_setup
 
 GOOD = """
@@ -54,10 +54,9 @@ def load(tmp_path: Path, text: str):
 @pytest.fixture
 def kinds():
     """What a test registers is forgotten again."""
-    before = dict(_KINDS)
     yield
-    _KINDS.clear()
-    _KINDS.update(before)
+    for name in set(KINDS) - set(_BUILT_IN):
+        KINDS.forget(name)
 
 
 def test_a_file_makes_a_suite(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def _answered(arguments: list[str]) -> int:
     kept_level = take_option(rest, "--log-level")
     if kept_level is not None:
         set_level(kept_level)
-    code: int = import_module(f"vislam.cli.verbs.{name}").main(rest)
+    code: int = (VERBS[name].main or import_module(f"vislam.cli.verbs.{name}").main)(rest)
     return code
 
 

@@ -210,6 +210,8 @@ def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Option
         first = error.errors()[0]
         field_path = ".".join(str(part) for part in first["loc"])
         raise UsageError(f"{where}: option {field_path}: {first['msg']}, got {first['input']!r}") from error
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from error
     check_ranges(options, where)
     return options
 

@@ -1,11 +1,13 @@
 """Defaults of the visual front end and of initialisation."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from vislam.config.ranges import Count, Finite, NonNegative, Positive, Share, Whole
+from vislam.core.kinds import check_name
 
-Mode = Literal["auto", "mono", "stereo", "rgbd", "planar"]
+_OwnMode = Literal["auto", "mono", "stereo", "rgbd", "planar"]
+Mode = _OwnMode | str  # or what a package brings: docs/extend.md
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +122,10 @@ class FrontEndConfig:
     described_features: Count = 1000  # ORB keypoints per keyframe for loop closing
 
     planar: PlanarConfig = field(default_factory=PlanarConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse a front end that there is not."""
+        check_name("frontend.mode", self.mode, get_args(_OwnMode), "vislam.front_ends")
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,6 +48,7 @@ class LoopConfig:
     depth_worth_m: NonNegative = 0.03  # of that pose, one sigma: known better, depth adds little to it ...
     depth_worth_deg: NonNegative = 1.5  # ... nor to where it looks: an answer is good to 1 cm and 0.6 deg
     start_in_map: str | None = None  # X,Y,Z,QX,QY,QZ,QW of the body in OLD's map at the begin, for depth: 0.3 m, 15 deg
+    proposers: tuple[str, ...] = ()  # that packages bring, asked for candidates beside appearance, odometry and tags
     inject_share: Share = 0.0  # for experiments: share of false loops, made up, among those that the graph is offered
     inject_group: Count = 1  # how many of them agree among themselves, as from an object that is there twice
 

@@ -1,9 +1,10 @@
 """Defaults of dense maps and of maps to drive by."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from vislam.config.ranges import Count, Finite, NonNegative, Positive, PositiveShare, Probability, Range, Share, Whole
+from vislam.core.kinds import check_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +20,8 @@ class DriveConfig:
     slope_window_m: NonNegative = 0.40
 
 
-MapProduct = Literal["cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
+_OwnProduct = Literal["cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
+MapProduct = _OwnProduct | str  # or what a package brings: docs/extend.md
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,3 +123,8 @@ class MapConfig:
     products: tuple[MapProduct, ...] = ("cloud", "octomap", "grid", "drive")
     labels: LabelConfig = field(default_factory=LabelConfig)
     mono_depth: MonoDepthConfig = field(default_factory=MonoDepthConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse a product that there is not."""
+        for product in self.products:
+            check_name("map.products", product, get_args(_OwnProduct), "vislam.map_products")

@@ -10,13 +10,14 @@ from typing import Protocol
 
 from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError, UsageError
+from vislam.core.kinds import Kinds, lacking
 from vislam.core.recording import Recording
 from vislam.datasets import bags
 from vislam.datasets.calibrated import calibrated, with_imu_rate
 from vislam.datasets.formats import asl, kitti, phone, tum, video
 from vislam.datasets.stream import FileRecording, Survey
 
-__all__ = ["READERS", "Reader", "open_dataset", "survey"]
+__all__ = ["READERS", "FileRecording", "Reader", "Survey", "open_dataset", "survey"]
 
 
 class Reader(Protocol):
@@ -33,9 +34,11 @@ class Reader(Protocol):
         ...
 
 
-READERS: dict[str, Reader] = {
-    "euroc": asl, "tum": tum, "kitti": kitti, "video": video, "phone": phone, "bag": bags,
-}  # fmt: skip
+READERS = Kinds[Reader](
+    "vislam.readers",
+    {"euroc": asl, "tum": tum, "kitti": kitti, "video": video, "phone": phone, "bag": bags},
+    lacking("LOOKS_FOR", "recognises", "survey"),
+)
 
 
 def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Recording:

@@ -22,6 +22,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.imu_noise import ImuNoise
+from vislam.core.kinds import Kinds, lacking
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
@@ -34,6 +35,7 @@ from vislam.runs.sources import shaken
 from vislam.trajectory import write_tum
 
 _DOORS = ("inertial", "frame", "answer")
+ESTIMATORS = Kinds[type[Any]]("vislam.estimators", {}, lacking(*_DOORS))  # by name, of installed packages
 _RIGID = 1e-3  # largest entry of R^T R - 1; estimators round
 
 
@@ -81,8 +83,11 @@ class ProgramError(VislamError):
 def load(program: str) -> type[Any]:
     """Return the class, see `Program`, of `FILE.py`, `FILE.py:CLASS`, `PACKAGE.MODULE` or `PACKAGE.MODULE:CLASS`.
 
-    Without a name it is the only class there with all doors. Raises UsageError where there is none.
+    Without a name it is the only class there with all doors. A name that a package brings by an entry point will do as
+    well. Raises UsageError where there is none.
     """
+    if program.isidentifier() and program in ESTIMATORS:
+        return ESTIMATORS[program]
     place, _, name = program.rpartition(":") if ":" in program else (program, "", "")
     module = _module(place, program)
     own = [cls for _, cls in inspect.getmembers(module, inspect.isclass) if cls.__module__ == module.__name__]

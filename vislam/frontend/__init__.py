@@ -5,6 +5,7 @@ from __future__ import annotations
 from vislam.config import FrontEndConfig
 from vislam.config.frontend import Mode
 from vislam.core.camera import Rig
+from vislam.core.kinds import Kinds, lacking
 from vislam.frontend.metric import RgbdFrontEnd, StereoFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
@@ -14,12 +15,11 @@ from vislam.imu import ImuNoise
 __all__ = ["FRONT_ENDS", "FrontEnd", "TrackResult", "common_errors", "knows_scale", "make_frontend", "mode_for"]
 
 
-FRONT_ENDS: dict[str, type[FrontEnd]] = {
-    "rgbd": RgbdFrontEnd,
-    "stereo": StereoFrontEnd,
-    "mono": MonoFrontEnd,
-    "planar": PlanarFrontEnd,
-}
+FRONT_ENDS = Kinds[type[FrontEnd]](
+    "vislam.front_ends",
+    {"rgbd": RgbdFrontEnd, "stereo": StereoFrontEnd, "mono": MonoFrontEnd, "planar": PlanarFrontEnd},
+    lacking("knows_scale", "errors", "track", "begin_at"),
+)
 
 
 def knows_scale(mode: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -11,6 +12,7 @@ from pathlib import Path
 from vislam.config import Config, SensorCalibration, SensorsConfig, validated
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError
+from vislam.core.kinds import Kinds
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
@@ -38,6 +40,20 @@ from vislam.sensors import SensorSetup
 from vislam.trajectory import Trajectory
 
 
+def _virtual_cart(rest: str, config: Config, _: SensorsConfig) -> tuple[LiveSource, Config]:
+    cart = VirtualCart(_place_options(rest), config.machine.gravity_m_s2)
+    return cart, cart.settings(config)
+
+
+def _replay(rest: str, config: Config, _: SensorsConfig) -> tuple[LiveSource, Config]:
+    return ReplaySource(rest, config.seed, calibration=config.calibration), with_clock(config)
+
+
+# what opens a source of a name, of the text behind `NAME:` or `NAME,`
+OpenLive = Callable[[str, Config, SensorsConfig], tuple[LiveSource, Config]]
+LIVE_SOURCES = Kinds[OpenLive]("vislam.live_sources", {"virtual-cart": _virtual_cart, "replay": _replay})
+
+
 def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveSource, Config]:
     """Return the sensors that are asked for, and the settings with what those know better.
 
@@ -50,13 +66,10 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
         UsageError: there is no such source, or an option of it is wrong.
         DataError: a calibration file or recording cannot be used.
     """
-    kind, _, rest = asked.partition(",")
-    if kind == "virtual-cart":
-        cart = VirtualCart(_place_options(rest), config.machine.gravity_m_s2)
-        return cart, cart.settings(config)
-    if asked.startswith("replay:"):
-        replay = ReplaySource(asked.removeprefix("replay:"), config.seed, calibration=config.calibration)
-        return replay, with_clock(config)
+    kind = asked.partition(",")[0]
+    name = re.split("[:,]", asked, maxsplit=1)[0]
+    if name in LIVE_SOURCES:
+        return LIVE_SOURCES[name](asked[len(name) + 1 :], config, sensors)
     inertial, plus, camera = asked.partition("+")
     if not plus and kind.partition(":")[0] in WITH_IMU:
         inertial, camera = kind, asked  # a camera with the IMU inside it

@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from vislam.loop.closer import LoopCloser
     from vislam.loop.detector import Loop, LoopDetector
     from vislam.loop.table import LoopRow, read_loops
+    from vislam.loop.view import View
 
-__all__ = ["Loop", "LoopCloser", "LoopDetector", "LoopRow", "read_loops"]
+__all__ = ["Loop", "LoopCloser", "LoopDetector", "LoopRow", "View", "read_loops"]
 
 __getattr__ = late(
     __name__,
@@ -20,6 +21,7 @@ __getattr__ = late(
         "LoopCloser": "vislam.loop.closer",
         "LoopDetector": "vislam.loop.detector",
         "LoopRow": "vislam.loop.table",
+        "View": "vislam.loop.view",
         "read_loops": "vislam.loop.table",
     },
 )

@@ -2,20 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.core.camera import Camera
+from vislam.config import LoopConfig
+from vislam.core.camera import Camera, Rig
+from vislam.core.errors import UsageError
 from vislam.core.jit import njit
+from vislam.core.kinds import Kinds
 from vislam.core.messages import Array
 from vislam.loop.verification import Likeness
+from vislam.loop.view import View
 
 _MAX_VIEW_ANGLE_RAD = np.deg2rad(45.0)  # between the rays to one point; ORB matches little beyond
 _MAX_DISTANCE_RATIO = 2.5  # of a point from both cameras; ORB's octaves span 3.6
 _NEAR_Z_M = 0.1
+
+
+class Propose(Protocol):
+    """What a proposer that a package brings does: `CLASS(config, rig)` makes one for each run."""
+
+    def __call__(self, view: View, known: Mapping[int, View], /) -> Sequence[int]:
+        """Return ids of known keyframes that may show the place of the newest one, best first; deterministic."""
+        ...
+
+
+PROPOSERS = Kinds[Callable[[LoopConfig, Rig], Propose]]("vislam.loop_proposers", {})
+
+
+def proposer(name: str) -> Callable[[LoopConfig, Rig], Propose]:
+    """Return what makes a proposer; raises UsageError for one that no package brings."""
+    if name not in PROPOSERS:
+        raise UsageError(
+            f"no loop proposer '{name}' is installed; loop.proposers takes {', '.join(PROPOSERS) or 'none'}"
+        )
+    return PROPOSERS[name]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +48,7 @@ class Candidate:
     """An old keyframe that may show the same place."""
 
     id: int
-    source: str  # "appearance", "odometry", "tag" or "depth"
+    source: str  # "appearance", "odometry", "tag", "depth" or a proposer of `loop.proposers`
     score: float  # similarity of an island of keyframes, or share of what should be visible in both
     consistency: int = 0  # how many keyframes before this one pointed at the same place in a row
 

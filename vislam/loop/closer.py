@@ -21,7 +21,7 @@ from vislam.core.messages import (
     RetrievedKeyframe,
     Submaps,
 )
-from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, view_bounds
+from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, proposer, view_bounds
 from vislam.loop.pose_table import PoseTable
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verification import Likeness, Verification, Verifier, judge, tilt_error_rad
@@ -56,6 +56,7 @@ class LoopCloser:
         self._appearance = AppearanceCandidates(config.island_gap)
         self._verifier = Verifier(config, rig, seed)
         self._tags = TagBook()
+        self._proposers = {name: proposer(name)(config, rig) for name in config.proposers}
         self._next_edge_id = 0
         self._likeness: dict[int, Likeness] = {}  # of those to the newest keyframe
         self.retrieved: list[RetrievedKeyframe] = []  # what looked most like the newest keyframe
@@ -151,13 +152,16 @@ class LoopCloser:
         return sight_tags(keyframe.frame, self._rig.cameras[0], config) if is_looked_at else ()
 
     def _candidates(self, view: View) -> list[Candidate]:
-        """Return candidates in the order of verification: by tags, then by appearance and odometry in turn.
+        """Return candidates in the order of verification: by tags, of packages, by appearance and odometry in turn.
 
         Of an old keyframe and its neighbours that both suggest, it is appearance that matching has confirmed already.
         """
         config = self._config
         old = self._poses.ids[self._old(view)]
         order = self._tags.candidates(view.id, int(old[-1]), _MAX_TAGS) if len(old) else []
+        for name, propose in self._proposers.items():
+            known = {k: self._views[k] for k in old.tolist() if k in self._views}
+            order += _apart([Candidate(k, name, 0.0) for k in propose(view, known) if k in known], order, 0)
         near = _apart(self._near(view), order, 0)
         wanted = max(config.max_appearance, config.max_verifications - len(order) - len(near))
         alike = _apart(self._alike(view), order, config.island_gap)[: wanted if config.max_appearance else 0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vislam.config import MapConfig
 from vislam.core.errors import DataError, StorageError
 from vislam.core.files import replacing
+from vislam.core.kinds import Kinds, lacking
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh, poisson_mesh
 from vislam.mapping.cloud.surfels import Surfels
@@ -48,6 +49,18 @@ class NotLevel:
 
 
 LEVEL = NotLevel(None, None)  # z is up everywhere
+
+
+class MapProduct(Protocol):
+    """A product that a package brings."""
+
+    FILE: str  # its name in the folder
+
+    def write(self, path: Path, source: MapSource) -> str | None:
+        """Write it; return the reason where there is none."""
+
+
+PRODUCTS = Kinds[MapProduct]("vislam.map_products", {}, lacking("FILE", "write"))
 
 
 class MapSource(Protocol):
@@ -122,7 +135,10 @@ def write_products(
     for product in (*dict.fromkeys(config.products), *(() if labels is None else ("labels",))):
         if step is not None and product in config.products:
             step(product)
-        path = folder / FILES[product]
+        own = None if product in FILES else PRODUCTS[product]
+        path = folder / (FILES[product] if own is None else own.FILE)
+        if own is not None:
+            writers[product] = partial(own.write, source=source)
         if not_level is not None and product in NEEDS_UP:
             notes[product] = not_level
             _remove_grid(folder, product)

@@ -5,12 +5,19 @@ from __future__ import annotations
 import re
 
 from vislam.core.errors import UsageError
+from vislam.core.kinds import Kinds
 from vislam.sensors import kinds as built_in
 from vislam.sensors.configured import Configured
 
-GROUP = "vislam.sensors"  # of entry points: `kind = "package.module:Class"`
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_KINDS: dict[str, type[Configured]] = {
+
+
+def _no_sensor(cls: object) -> str:
+    is_one = isinstance(cls, type) and issubclass(cls, Configured) and hasattr(cls, "Settings")
+    return "" if is_one else "is no subclass of vislam.sensors.Configured with a dataclass `Settings`"
+
+
+_BUILT_IN: dict[str, type[Configured]] = {
     "position": built_in.Position,
     "range": built_in.AnchorRange,
     "height": built_in.Height,
@@ -23,7 +30,7 @@ _KINDS: dict[str, type[Configured]] = {
     "pose": built_in.Pose,
     "odometry": built_in.Odometry,
 }
-_BUILT_IN = frozenset(_KINDS)
+KINDS = Kinds[type[Configured]]("vislam.sensors", _BUILT_IN, _no_sensor)
 
 
 def register(kind: str, cls: type[Configured]) -> None:
@@ -35,41 +42,13 @@ def register(kind: str, cls: type[Configured]) -> None:
         raise UsageError(f"kind {kind!r}: small letters, digits and _ are asked, a letter first, 32 at most")
     if kind in _BUILT_IN:
         raise UsageError(f"kind {kind!r} is built in; choose another name")
-    _check(kind, cls, "")
-    _KINDS[kind] = cls
+    KINDS.add(kind, cls)
 
 
 def kind_class(kind: str) -> type[Configured]:
-    """Return the class of a kind. Raises UsageError for one that nobody brings, or whose package is broken."""
-    if kind not in _KINDS:
-        _KINDS[kind] = _installed(kind)
-    return _KINDS[kind]
-
-
-def _installed(kind: str) -> type[Configured]:
-    """Return the class that an installed package brings; packages are looked through only here, for it takes time."""
-    from importlib.metadata import entry_points
-
-    found = list(entry_points(group=GROUP, name=kind))
-    if not found:
-        known = sorted({*_KINDS, *(point.name for point in entry_points(group=GROUP))})
-        raise UsageError(f"no kind of sensor is called {kind!r}; there are: {', '.join(known)}; docs/your-sensor.md")
-    packages = [point.dist.name if point.dist else "an unknown package" for point in found]
-    if len(found) > 1:
-        raise UsageError(f"kind {kind!r} comes from several packages: {', '.join(packages)}; uninstall all but one")
+    """Return the class of a kind. Raises UsageError for one that there is not, or whose package is broken."""
     try:
-        cls = found[0].load()
-    except Exception as error:  # it is somebody else's code
-        raise UsageError(
-            f"kind {kind!r} of package {packages[0]} cannot be loaded from {found[0].value!r}: "
-            f"{type(error).__name__}: {error}; repair or uninstall it"
-        ) from error
-    _check(kind, cls, f" of package {packages[0]}")
-    return cls
-
-
-def _check(kind: str, cls: object, of: str) -> None:
-    if not (isinstance(cls, type) and issubclass(cls, Configured) and hasattr(cls, "Settings")):
-        raise UsageError(
-            f"kind {kind!r}{of}: {cls!r} is no subclass of vislam.sensors.Configured with a dataclass `Settings`"
-        )
+        return KINDS[kind]
+    except KeyError:
+        known = ", ".join(sorted(KINDS))
+        raise UsageError(f"no kind of sensor is called {kind!r}; there are: {known}; docs/extend.md") from None

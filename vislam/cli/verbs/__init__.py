@@ -6,7 +6,10 @@ What takes long to import is imported after the arguments are understood, so tha
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+
+from vislam.core.kinds import Kinds, lacking
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,9 +19,11 @@ class Verb:
     summary: str
     example: str
     compile_s: int | None = None  # CPU seconds of compilation where no kernel is there yet; 0: none, None: not measured
+    # of a verb that a package brings: takes the arguments and returns the exit code
+    main: Callable[[list[str]], int] | None = None
 
 
-VERBS = {
+_VERBS = {
     "demo": Verb("simulate a cart in a workshop and run everything on it", "vislam demo", 90),
     "run": Verb(
         "run the pipeline on a recording; --resume RUN goes on with one", "vislam run tum:PATH --out runs/desk", 90
@@ -62,3 +67,5 @@ VERBS = {
     ),
     "completion": Verb("print what makes bash or zsh complete all this", "vislam completion bash >> ~/.bashrc", 0),
 }
+
+VERBS = Kinds[Verb]("vislam.verbs", _VERBS, lacking("summary", "example", "main"))
