@@ -104,7 +104,7 @@ def step(
 ) -> tuple[Array, Array]:
     x, P = x.copy(), P.copy()
     sigmas = np.array([white, white, 0.0, 0.0, 0.5, 2.0])
-    kernels.predict(x, P, s0, s1, dt, gap_s, sigmas, MACHINE)
+    kernels.predict(x, P, s0, s1, dt, gap_s, sigmas, GRAVITY_M_S2)
     return x, P
 
 
