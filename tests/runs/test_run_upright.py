@@ -22,7 +22,6 @@ from vislam.runs.offline.rebuild import map_settings, rebuild
 from vislam.runs.report import write_report
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
-from vislam.sim.faults.faults import FaultyRecording
 from vislam.trajectory import align, associate, read_tum
 
 CONFIG = Config(imu=ImuConfig(enabled=False), map=MapConfig(), view=ViewConfig(enabled=False))
@@ -174,8 +173,7 @@ def test_recordings_stand_upright(name, up, data_root, tmp_path):
     if not path.is_dir():
         missing(f"needs {path}")
     config = replace(CONFIG, map=MapConfig(products=("cloud",)))
-    piece = FaultyRecording(open_source(f"tum:{path}", 0), length_s=8.0)
-    execute(piece, config, tmp_path, source=f"tum:{path}", command=["test"])
+    execute(open_source(f"tum:{path}", 0), config, tmp_path, source=f"tum:{path}", command=["test"])
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["up"]["source"] == ("accelerometer" if name == "tum_fr1_desk" else "planes")
     assert lean_deg(tmp_path, up=up) < 2.0
