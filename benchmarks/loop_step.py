@@ -31,7 +31,7 @@ import results  # noqa: E402
 from vislam.config import LoopConfig, LoopTruthConfig  # noqa: E402
 from vislam.core.geometry import invert, so3_log  # noqa: E402
 from vislam.core.messages import Frame, Keyframe, LoopCandidate, LoopDecision, LoopEdge  # noqa: E402
-from vislam.loop.closer import LoopCloser  # noqa: E402
+from vislam.loop import LoopCloser  # noqa: E402
 from vislam.runs.session.reader import Session, StoredKeyframe  # noqa: E402
 
 RULE = LoopTruthConfig()

@@ -26,7 +26,7 @@ from vislam.config import MapConfig  # noqa: E402
 from vislam.core.geometry import se3_exp  # noqa: E402
 from vislam.core.memory import PackedScan  # noqa: E402
 from vislam.core.messages import GraphUpdate  # noqa: E402
-from vislam.factors.factor_log import rig_from  # noqa: E402
+from vislam.factors import rig_from  # noqa: E402
 from vislam.mapping.mapper import Mapper  # noqa: E402
 from vislam.mapping.octree.octomap_io import encode_ot  # noqa: E402
 from vislam.runs.session import Session  # noqa: E402

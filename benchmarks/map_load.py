@@ -33,8 +33,7 @@ from vislam.core.messages import (
     Tracking,
     VoMeasurement,
 )
-from vislam.loop.closer import LoopCloser
-from vislam.loop.words.vocabulary import train
+from vislam.loop import LoopCloser, train
 from vislam.runs.session import Session, SessionWriter, recall
 from vislam.slam import Slam
 

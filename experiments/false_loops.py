@@ -36,10 +36,9 @@ from vislam.core.messages import (
     VoMeasurement,
     no_observations,
 )
-from vislam.factors.journal import loop_record
-from vislam.factors.loop import LoopModel
+from vislam.factors import LoopModel, loop_record
 from vislam.graph import PoseGraph
-from vislam.loop.injection import FalseLoops, is_injected
+from vislam.loop import FalseLoops, is_injected
 
 _DRIFT_SIGMAS = np.repeat([0.01, 0.05], 3)  # of a step of odometry, per unit of drift
 _FALSE_SIGMAS = np.repeat([0.05, 0.3], 3)  # of the pose that a false loop claims: two places that look alike

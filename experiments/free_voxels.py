@@ -36,7 +36,7 @@ from vislam.config import MapConfig  # noqa: E402
 from vislam.core.geometry import so3_exp, transform  # noqa: E402
 from vislam.core.memory import PackedScan  # noqa: E402
 from vislam.core.messages import Array  # noqa: E402
-from vislam.factors.factor_log import rig_from  # noqa: E402
+from vislam.factors import rig_from  # noqa: E402
 from vislam.mapping.cloud.store import KeyframeStore  # noqa: E402
 from vislam.mapping.depth.extract import ScanExtractor  # noqa: E402
 from vislam.mapping.depth.image import DepthView, filter_depth, scan_points, surface_points  # noqa: E402

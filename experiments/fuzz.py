@@ -582,7 +582,7 @@ def _read_maps(folder: Path) -> None:
 
 
 def _vocabularies() -> list[dict[str, bytes]]:
-    from vislam.loop.words.vocabulary import train
+    from vislam.loop import train
 
     rng = np.random.default_rng(2)
     small = train([rng.integers(0, 256, (60, 32), np.uint8) for _ in range(3)], 3, 2, 0, 1000)
@@ -591,8 +591,7 @@ def _vocabularies() -> list[dict[str, bytes]]:
 
 
 def _read_vocabularies(folder: Path) -> None:
-    from vislam.loop.words.orbslam import read_orbslam
-    from vislam.loop.words.vocabulary import Vocabulary
+    from vislam.loop import Vocabulary, read_orbslam
 
     for path in folder.iterdir():
         vocabulary = Vocabulary.load(path) if path.suffix == ".npz" else read_orbslam(path)
@@ -619,7 +618,7 @@ _RETRIEVED = b"from_id,to_id,score,island_score,consistency\n" + b"".join(b"%d,1
 
 
 def _loops_csv() -> bytes:
-    from vislam.loop.table import LoopRow, loops_text
+    from vislam.loop import LoopRow, loops_text
 
     told = ("words", 0.5, 40, 3, 0.1, 2, 1.5, 1.0, float("nan"), float("nan"), np.eye(4), "accepted", "")
     rows = [LoopRow(i, i + 5, 10 * i, 10 * i + 50, *told) for i in range(9)]
@@ -627,7 +626,7 @@ def _loops_csv() -> bytes:
 
 
 def _read_tables(folder: Path) -> None:
-    from vislam.loop.table import read_loops, read_retrieved
+    from vislam.loop import read_loops, read_retrieved
 
     read_loops(folder / "loops.csv")
     read_retrieved(folder / "retrieved.csv")

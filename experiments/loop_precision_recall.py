@@ -31,8 +31,7 @@ from vislam.config import LoopTruthConfig
 from vislam.core.errors import VislamError
 from vislam.core.files import write_json, write_text
 from vislam.core.messages import Array, Frame, Keyframe, LoopCandidate
-from vislam.loop.closer import LoopCloser
-from vislam.loop.table import LoopRow, loops_text, retrieved_text
+from vislam.loop import LoopCloser, LoopRow, loops_text, retrieved_text
 from vislam.runs.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
 from vislam.runs.report import write_loop_plot
 from vislam.runs.session import Session

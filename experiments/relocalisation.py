@@ -52,8 +52,7 @@ from vislam.core.recording import Recording, WrappedRecording
 from vislam.datasets import open_dataset
 from vislam.frontend import make_frontend
 from vislam.graph import PoseGraph
-from vislam.loop.closer import LoopCloser
-from vislam.loop.evaluation import true_places
+from vislam.loop import LoopCloser, true_places
 from vislam.pipeline.front import Front
 from vislam.sim import open_world
 from vislam.sim.worlds.simulation import Simulation

@@ -27,7 +27,7 @@ from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
 from vislam.experiment.stated import checked, write_stated
-from vislam.factors.keys import nearest_rigid
+from vislam.factors import nearest_rigid
 from vislam.frontend import mode_for
 from vislam.runs.cost import CostMeter
 from vislam.runs.drive import Progress, imu_noise

@@ -1,1 +1,65 @@
 """Factors of the pose graph, built from plain measurements; the only room besides the graph that knows gtsam."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vislam.core.late import late
+
+if TYPE_CHECKING:
+    from vislam.factors.factor_log import (
+        FactorLog,
+        LoggedEdge,
+        LoggedKeyframe,
+        rig_data,
+        rig_from,
+        state_data,
+        state_from,
+    )
+    from vislam.factors.journal import LoopRecord, checked_pose, loop_record
+    from vislam.factors.keys import nearest_rigid
+    from vislam.factors.loop import LoopModel
+    from vislam.factors.noise_models import checked_covariance, conditioned
+    from vislam.factors.visual import measurement_of
+    from vislam.factors.window import WindowOdometry
+
+__all__ = [
+    "FactorLog",
+    "LoggedEdge",
+    "LoggedKeyframe",
+    "LoopModel",
+    "LoopRecord",
+    "WindowOdometry",
+    "checked_covariance",
+    "checked_pose",
+    "conditioned",
+    "loop_record",
+    "measurement_of",
+    "nearest_rigid",
+    "rig_data",
+    "rig_from",
+    "state_data",
+    "state_from",
+]
+
+__getattr__ = late(
+    __name__,
+    {
+        "FactorLog": "vislam.factors.factor_log",
+        "LoggedEdge": "vislam.factors.factor_log",
+        "LoggedKeyframe": "vislam.factors.factor_log",
+        "LoopModel": "vislam.factors.loop",
+        "LoopRecord": "vislam.factors.journal",
+        "WindowOdometry": "vislam.factors.window",
+        "checked_covariance": "vislam.factors.noise_models",
+        "checked_pose": "vislam.factors.journal",
+        "conditioned": "vislam.factors.noise_models",
+        "loop_record": "vislam.factors.journal",
+        "measurement_of": "vislam.factors.visual",
+        "nearest_rigid": "vislam.factors.keys",
+        "rig_data": "vislam.factors.factor_log",
+        "rig_from": "vislam.factors.factor_log",
+        "state_data": "vislam.factors.factor_log",
+        "state_from": "vislam.factors.factor_log",
+    },
+)

@@ -7,21 +7,109 @@ from typing import TYPE_CHECKING
 from vislam.core.late import late
 
 if TYPE_CHECKING:
+    from vislam.loop.candidates import Candidate
     from vislam.loop.closer import LoopCloser
     from vislam.loop.detector import Loop, LoopDetector
-    from vislam.loop.table import LoopRow, read_loops
-    from vislam.loop.view import View
+    from vislam.loop.evaluation import (
+        DOUBTFUL,
+        RIGHT,
+        WRONG,
+        Detections,
+        TruePlaces,
+        bootstrap_interval,
+        precision_recall,
+        true_places,
+    )
+    from vislam.loop.injection import INJECTED, FalseLoops, as_candidate, is_injected
+    from vislam.loop.table import (
+        LoopRow,
+        caption,
+        csv_text,
+        loops_text,
+        read_loops,
+        read_retrieved,
+        read_rows,
+        retrieved_text,
+    )
+    from vislam.loop.verification import Verification, Verifier
+    from vislam.loop.view import View, make_view
+    from vislam.loop.words import BagOfWords, PlaceDatabase, Vocabulary, depth_for, read_orbslam, seed_vocabulary, train
 
-__all__ = ["Loop", "LoopCloser", "LoopDetector", "LoopRow", "View", "read_loops"]
+__all__ = [
+    "DOUBTFUL",
+    "INJECTED",
+    "RIGHT",
+    "WRONG",
+    "BagOfWords",
+    "Candidate",
+    "Detections",
+    "FalseLoops",
+    "Loop",
+    "LoopCloser",
+    "LoopDetector",
+    "LoopRow",
+    "PlaceDatabase",
+    "TruePlaces",
+    "Verification",
+    "Verifier",
+    "View",
+    "Vocabulary",
+    "as_candidate",
+    "bootstrap_interval",
+    "caption",
+    "csv_text",
+    "depth_for",
+    "is_injected",
+    "loops_text",
+    "make_view",
+    "precision_recall",
+    "read_loops",
+    "read_orbslam",
+    "read_retrieved",
+    "read_rows",
+    "retrieved_text",
+    "seed_vocabulary",
+    "train",
+    "true_places",
+]
 
 __getattr__ = late(
     __name__,
     {
+        "DOUBTFUL": "vislam.loop.evaluation",
+        "INJECTED": "vislam.loop.injection",
+        "RIGHT": "vislam.loop.evaluation",
+        "WRONG": "vislam.loop.evaluation",
+        "BagOfWords": "vislam.loop.words",
+        "Candidate": "vislam.loop.candidates",
+        "Detections": "vislam.loop.evaluation",
+        "FalseLoops": "vislam.loop.injection",
         "Loop": "vislam.loop.detector",
         "LoopCloser": "vislam.loop.closer",
         "LoopDetector": "vislam.loop.detector",
         "LoopRow": "vislam.loop.table",
+        "PlaceDatabase": "vislam.loop.words",
+        "TruePlaces": "vislam.loop.evaluation",
+        "Verification": "vislam.loop.verification",
+        "Verifier": "vislam.loop.verification",
         "View": "vislam.loop.view",
+        "Vocabulary": "vislam.loop.words",
+        "as_candidate": "vislam.loop.injection",
+        "bootstrap_interval": "vislam.loop.evaluation",
+        "caption": "vislam.loop.table",
+        "csv_text": "vislam.loop.table",
+        "depth_for": "vislam.loop.words",
+        "is_injected": "vislam.loop.injection",
+        "loops_text": "vislam.loop.table",
+        "make_view": "vislam.loop.view",
+        "precision_recall": "vislam.loop.evaluation",
         "read_loops": "vislam.loop.table",
+        "read_orbslam": "vislam.loop.words",
+        "read_retrieved": "vislam.loop.table",
+        "read_rows": "vislam.loop.table",
+        "retrieved_text": "vislam.loop.table",
+        "seed_vocabulary": "vislam.loop.words",
+        "train": "vislam.loop.words",
+        "true_places": "vislam.loop.evaluation",
     },
 )

@@ -11,7 +11,7 @@ from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, se3_exp
 from vislam.core.messages import Array, LoopCandidate, LoopDecision, LoopEdge
 
-SOURCE = "injected"  # of candidates
+INJECTED = "injected"  # of candidates
 FIRST_ID = 1_000_000_000  # ids from here on are injected; those of the detector never get there
 _TRIES = 50  # to find two different places
 _APART_M = 1.0  # two keyframes nearer than this, or than a tenth of what was seen of the world, may be one place
@@ -92,6 +92,7 @@ def is_injected(edge_id: int) -> bool:
 def as_candidate(edge: LoopEdge) -> LoopCandidate:
     """Return the record of a false loop, which says what it is."""
     return LoopCandidate(
-        edge.from_id, edge.to_id, SOURCE, edge.score, edge.inliers, LoopDecision.ACCEPTED, "false, injected on purpose",
-        sigma_m=float(np.sqrt(np.trace(edge.covariance[3:, 3:]) / 3.0)), T_from_to=edge.T_from_to,
+        edge.from_id, edge.to_id, INJECTED, edge.score, edge.inliers, LoopDecision.ACCEPTED,
+        "false, injected on purpose", sigma_m=float(np.sqrt(np.trace(edge.covariance[3:, 3:]) / 3.0)),
+        T_from_to=edge.T_from_to,
     )  # fmt: skip

@@ -24,8 +24,7 @@ from vislam.core.messages import (
 )
 from vislam.frontend import knows_scale, mode_for
 from vislam.graph import PoseGraph
-from vislam.loop.closer import LoopCloser
-from vislam.loop.injection import FalseLoops, as_candidate
+from vislam.loop import FalseLoops, LoopCloser, as_candidate
 from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.semantic.images import Labeller

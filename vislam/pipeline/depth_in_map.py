@@ -18,8 +18,7 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array, GraphUpdate, Keyframe, KeyframePacket, LoopEdge, Submaps
-from vislam.loop.candidates import Candidate
-from vislam.loop.verification import Verification
+from vislam.loop import Candidate, Verification
 from vislam.mapping.depth.localise import DepthAnswer, Guess
 from vislam.mapping.depth.stored import stored_depth
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe

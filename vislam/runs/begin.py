@@ -17,7 +17,7 @@ from vislam.core.geometry import invert, rotation_from_quaternion_xyzw, transfor
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
 from vislam.core.recording import Recording
-from vislam.factors.factor_log import rig_data
+from vislam.factors import rig_data
 from vislam.imu import ImuNoise
 from vislam.mapping.semantic.images import LabelFolder
 from vislam.pipeline.settings import derived

@@ -23,7 +23,7 @@ from vislam.core.memory import FrontMemory, GraphRecord, KeyframeEntry, SlamMemo
 from vislam.core.messages import Localisation, LoopDecision, Submaps, Tracking
 from vislam.core.recording import Recording
 from vislam.imu import ImuNoise
-from vislam.loop.table import LoopRow, caption
+from vislam.loop import LoopRow, caption
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.of_map import write_pictures
 from vislam.mapping.semantic.images import label_warnings

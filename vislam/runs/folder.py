@@ -35,9 +35,7 @@ from vislam.core.messages import (
 )
 from vislam.core.reading import read_json
 from vislam.core.revision import code_revision
-from vislam.loop.injection import SOURCE as INJECTED
-from vislam.loop.injection import is_injected
-from vislam.loop.table import LoopRow, csv_text, loops_text, retrieved_text
+from vislam.loop import INJECTED, LoopRow, csv_text, is_injected, loops_text, retrieved_text
 from vislam.mapping.products import FILES as MAP_FILES
 from vislam.mapping.semantic.layer_files import CLASSES_NAME as LABEL_CLASSES
 from vislam.pipeline.steps import KeyframeStep, Step

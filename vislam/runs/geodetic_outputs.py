@@ -16,7 +16,7 @@ from vislam.core.errors import DataError
 from vislam.core.files import write_text
 from vislam.core.messages import Array, NavState
 from vislam.datasets.sensor_files import local_frame
-from vislam.loop.table import csv_text
+from vislam.loop import csv_text
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.measuring_frame import UP, frame_pose, frame_variables
 from vislam.sensors.toml import load_sensor_setup

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Array, LoopDecision
-from vislam.loop.table import LoopRow, read_loops
+from vislam.loop import LoopRow, read_loops
 from vislam.runs.folder import read_metrics, recorded_alignment
 from vislam.runs.levelled import onto_map
 from vislam.trajectory import Trajectory, align, associate, read_states_csv, read_tum

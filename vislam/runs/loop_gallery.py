@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.messages import Array, ImageU8, LoopDecision
-from vislam.loop.table import LoopRow
+from vislam.loop import LoopRow
 from vislam.pipeline.steps import KeyframeStep
 from vislam.runs.folder import storage
 

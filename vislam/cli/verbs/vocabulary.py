@@ -43,7 +43,7 @@ OPTIONS = (VocabularyOptions,)
 def main(arguments: list[str]) -> int:
     """Train a vocabulary on images, or convert ORB-SLAM's."""
     options = parse(VocabularyOptions, arguments, "vocabulary")
-    from vislam.loop.words import read_orbslam
+    from vislam.loop import read_orbslam
     from vislam.runs.offline.train_vocabulary import train_vocabulary
 
     if (options.from_orbslam is None) != bool(options.sources):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from vislam.core.errors import DataError, UsageError
-from vislam.factors.factor_log import rig_from
+from vislam.factors import rig_from
 from vislam.mapping.depth.localise import DepthLocaliser
 from vislam.mapping.depth.stored import stored_depth
 from vislam.runs.levelled import stored_level

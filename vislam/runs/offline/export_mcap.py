@@ -20,7 +20,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError, StorageError, UsageError
 from vislam.core.geometry import invert_many, skew
 from vislam.core.messages import Array
-from vislam.factors.factor_log import rig_from
+from vislam.factors import rig_from
 from vislam.mapping.drive.grid import read_grid
 from vislam.mapping.formats.ply import read_ply
 from vislam.runs.loaded import KeyframeStates, LoadedRun, load_run

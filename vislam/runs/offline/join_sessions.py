@@ -20,10 +20,9 @@ from vislam.core.errors import TrackingLostError, UsageError
 from vislam.core.files import write_json, write_text
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, GraphUpdate, Submaps
-from vislam.factors.journal import loop_record
-from vislam.factors.loop import LoopModel
+from vislam.factors import LoopModel, loop_record
 from vislam.graph.joining import JOIN_FRAMES, RelativeCovariance, Waiting
-from vislam.loop.closer import LoopCloser
+from vislam.loop import LoopCloser
 from vislam.runs.folder import storage
 from vislam.runs.offline.session_graph import (
     Edges,

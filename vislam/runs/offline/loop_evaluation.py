@@ -14,19 +14,24 @@ from vislam.config import LoopTruthConfig
 from vislam.core.errors import DataError
 from vislam.core.files import write_json, write_text
 from vislam.core.messages import Array, LoopDecision, RetrievedKeyframe
-from vislam.factors.factor_log import rig_from
-from vislam.loop.evaluation import (
+from vislam.factors import rig_from
+from vislam.loop import (
     DOUBTFUL,
     RIGHT,
     WRONG,
+    BagOfWords,
     Detections,
+    LoopRow,
     TruePlaces,
+    Vocabulary,
     bootstrap_interval,
+    csv_text,
     precision_recall,
+    read_loops,
+    read_retrieved,
+    seed_vocabulary,
     true_places,
 )
-from vislam.loop.table import LoopRow, csv_text, read_loops, read_retrieved
-from vislam.loop.words import BagOfWords, Vocabulary, seed_vocabulary
 from vislam.runs.session import Session, StoredKeyframe
 from vislam.trajectory import Trajectory, associate, read_trajectory
 

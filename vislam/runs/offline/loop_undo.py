@@ -17,9 +17,9 @@ from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.memory import GraphRecord, LoopPlace, LoopState, OfferedLoop, SlamMemory
 from vislam.core.messages import GraphUpdate, LoopDecision
-from vislam.factors.factor_log import rig_from
+from vislam.factors import rig_from
 from vislam.graph import PoseGraph
-from vislam.loop.table import read_loops
+from vislam.loop import read_loops
 from vislam.runs.folder import RunLog, read_metrics, recorded_alignment
 from vislam.runs.further_sensors import suite_of
 from vislam.runs.geodetic_outputs import LINES, TABLES, GeodeticOutputs

@@ -16,7 +16,7 @@ from vislam.config import BatchConfig, Config, from_data
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.messages import NavState
-from vislam.factors.factor_log import FactorLog
+from vislam.factors import FactorLog
 from vislam.runs.folder import read_metrics, recorded_alignment
 from vislam.runs.further_sensors import suite_of
 from vislam.runs.levelled import Levelled, stored_level

@@ -22,7 +22,7 @@ from vislam.core.files import write_json
 from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
 from vislam.core.up import Up
-from vislam.factors.factor_log import rig_from
+from vislam.factors import rig_from
 from vislam.frontend import knows_scale, mode_for
 from vislam.mapping.cloud.store import packed_labels
 from vislam.mapping.depth.extract import ScanExtractor

@@ -17,11 +17,16 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.memory import LoopPlace, SlamMemory
 from vislam.core.messages import Array, Submaps
-from vislam.factors.factor_log import FactorLog
-from vislam.factors.journal import LoopRecord, checked_pose, loop_record
-from vislam.factors.noise_models import checked_covariance, conditioned
-from vislam.factors.visual import measurement_of
-from vislam.factors.window import WindowOdometry
+from vislam.factors import (
+    FactorLog,
+    LoopRecord,
+    WindowOdometry,
+    checked_covariance,
+    checked_pose,
+    conditioned,
+    loop_record,
+    measurement_of,
+)
 from vislam.runs.session import Session, recall
 from vislam.trajectory.frames import LoggedFrames
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import UsageError
 from vislam.core.messages import Frame, ImageU8
 from vislam.datasets.images import read_any_size
-from vislam.loop.words import Vocabulary, depth_for, train
+from vislam.loop import Vocabulary, depth_for, train
 from vislam.runs.sources import open_source
 from vislam.vision.features import describe
 

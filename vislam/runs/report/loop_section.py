@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 
-from vislam.loop.table import LoopRow, caption
+from vislam.loop import LoopRow, caption
 from vislam.runs.report import loop_plots
 from vislam.runs.report.html import Cell, card, escape, folded, grid, note, number, picture, section, table
 from vislam.runs.report.run_files import RunFiles, as_dict

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.messages import Array, NavState, Tracking
 from vislam.core.reading import read_json
-from vislam.loop.table import LoopRow, read_loops, read_rows
+from vislam.loop import LoopRow, read_loops, read_rows
 from vislam.runs.folder import TRACKING_COLUMNS
 from vislam.trajectory import Trajectory, read_states_csv, read_tum
 

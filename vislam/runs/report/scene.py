@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import VislamError
 from vislam.core.geometry import invert, sim3_parts, transform
 from vislam.core.messages import Array
-from vislam.loop.table import LoopRow
+from vislam.loop import LoopRow
 from vislam.runs.folder import recorded_alignment
 from vislam.runs.levelled import onto_map
 from vislam.runs.report.run_files import RunFiles, as_dict

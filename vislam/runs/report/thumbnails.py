@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.datasets.images import image_size
-from vislam.factors.factor_log import rig_from
+from vislam.factors import rig_from
 from vislam.runs.report.run_files import RunFiles
 from vislam.runs.session import Session
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.loop.table import caption
+from vislam.loop import caption
 from vislam.mapping.formats.ply import read_ply
 from vislam.runs.report.label_data import label_data
 from vislam.runs.report.page_assets import floats, packed

@@ -28,7 +28,7 @@ from vislam.core.messages import (
     RetrievedKeyframe,
     Tracking,
 )
-from vislam.factors.factor_log import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
+from vislam.factors import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
 from vislam.runs.session.checks import check_records, check_sound, has_labels, has_readings
 from vislam.runs.session.packets import LIGHT_COLUMNS, packet_of
 from vislam.runs.session.reading_rows import readings_of, starts_of

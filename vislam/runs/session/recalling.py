@@ -20,7 +20,7 @@ from vislam.core.memory import (
     at_pose,
 )
 from vislam.core.messages import Array, Frame, Keyframe, NavState
-from vislam.factors.factor_log import state_from
+from vislam.factors import state_from
 from vislam.runs.session.reader import Session
 from vislam.runs.session.reading_rows import own_of
 from vislam.runs.session.schema import maybe_numbers, noise_of, numbers, readable, window_of

@@ -25,7 +25,7 @@ from vislam.core.memory import (
     TagSighting,
 )
 from vislam.core.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
-from vislam.factors.factor_log import rig_data, state_data
+from vislam.factors import rig_data, state_data
 from vislam.imu import ImuNoise
 from vislam.runs.session.checks import check_records, check_sound, checksum, checksums, has_labels, has_readings
 from vislam.runs.session.packets import packet_row
