@@ -86,16 +86,15 @@ def close_loops(connection, stop, grown, closed, keyframes) -> None:
             closed.append(time.monotonic() - began)
 
 
-def listen(address: str, results, ready) -> None:
+def listen(address: str, results, ready, stop) -> None:
     """Note for each datagram how old its sample is when it is here."""
     from vislam.live.wire.publisher import PoseListener
 
     listener = PoseListener(address)
-    patience = time.monotonic() + 60.0  # for the first
     gc.disable()  # a collection would keep it from reading for a hundred milliseconds
     ready.wait()
     ages, sequences, quiet = [], [], 0
-    while quiet < 5 or (not ages and time.monotonic() < patience):
+    while quiet < 5 or not (ages or stop.is_set()):
         pose = listener.next(1.0)
         quiet = 0 if pose is not None else quiet + 1
         if pose is not None:
@@ -162,7 +161,7 @@ def processes(seconds: float, priority: int, keyframes: int) -> None:  # noqa: P
             "live.send_to": [address],
             "live.realtime_priority": priority,
         }
-        listener = context.Process(target=listen, args=(address, results, ready))
+        listener = context.Process(target=listen, args=(address, results, ready, stop))
         publisher = context.Process(
             target=fast, args=(signals, to_front, [hears_front, hears_back], settings, epoch, table, says)
         )
@@ -178,7 +177,7 @@ def processes(seconds: float, priority: int, keyframes: int) -> None:  # noqa: P
         grown.wait()
         go.set()
         taken = 0
-        at_front.settimeout(2.0)
+        at_front.settimeout(10.0)
         while True:
             try:
                 taken += len(at_front.recv(1 << 16))
@@ -195,6 +194,8 @@ def processes(seconds: float, priority: int, keyframes: int) -> None:  # noqa: P
         back.join()
         listener.join()
         loops = list(closed)
+    if len(poses) == 0:
+        raise SystemExit("no pose came to the reader: this machine is too busy")
     fresh = np.diff(poses[:, 1], prepend=poses[0, 1]) > 0  # the others are heartbeats, as is the first
     print(f"SCHED_FIFO {priority}" if priority and "warning" not in last else "no real-time priority")
     print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, {count} samples in {seconds:g} s")

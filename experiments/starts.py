@@ -40,7 +40,7 @@ from vislam.runs import imu_noise
 from vislam.runs.evidence import front_evidence, whole_evidence
 from vislam.runs.folder import RunLog
 from vislam.runs.metrics import initialisation
-from vislam.runs.sources import measured_inertial, open_source, shaken, split_source
+from vislam.runs.sources import is_world, measured_inertial, open_source, shaken, split_source
 from vislam.runs.verdict import judge as verdict_of
 from vislam.sim import MeasuredInertial, open_points
 from vislam.slam import Slam
@@ -100,7 +100,7 @@ def measured(uri: str) -> MeasuredInertial:
 def opened(job: Job) -> Recording:
     """Open the source of a job."""
     scheme, name, options = split_source(job.source)
-    if not scheme.startswith("points:"):
+    if is_world(scheme, name) or not scheme.startswith("points:"):
         return open_source(job.source, job.config["seed"])
     chosen = dict(part.split("=", 1) for part in options.split(",") if part)
     return open_points(measured(scheme.removeprefix("points:") + name), job.config["seed"], **chosen)
