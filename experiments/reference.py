@@ -28,7 +28,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DATA = Path(os.environ.get("VISLAM_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -137,20 +136,13 @@ def outputs(reference: Reference, folder: Path) -> dict[str, str]:
 
 
 def layout(run: Path) -> Iterator[str]:
-    """Yield what a run folder holds whatever the machine's speed: files, columns, and the keys of its metrics."""
+    """Yield what a run folder holds whatever the machine's speed: files, columns, and the sections of its metrics."""
     for path in sorted(path for path in run.rglob("*") if path.is_file()):
         yield path.relative_to(run).as_posix()
         if path.suffix == ".csv":
             with path.open() as file:
                 yield file.readline().strip()
-    yield from _keys(json.loads((run / "metrics.json").read_text()), "")
-
-
-def _keys(value: Any, at: str) -> Iterator[str]:
-    yield at
-    if isinstance(value, dict):
-        for key in sorted(value):
-            yield from _keys(value[key], f"{at}/{key}")
+    yield from sorted(json.loads((run / "metrics.json").read_text()))
 
 
 def differences(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> Iterator[str]:
