@@ -192,7 +192,7 @@ class Page:
         self.told: list[dict] = []
         self.pictures: list[bytes] = []
 
-    def tell(self, phase: str, **values) -> None:
+    def update(self, phase: str, **values) -> None:
         self.told.append(values)
 
     def show(self, jpeg: bytes) -> None:

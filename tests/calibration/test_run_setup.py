@@ -108,7 +108,7 @@ class Station:
     def asked(self):
         return [self._asked.pop(0)] if self._asked else []
 
-    def tell(self, phase: str, **values) -> None:
+    def update(self, phase: str, **values) -> None:
         self.told.append(values)
 
 

@@ -364,5 +364,5 @@ def test_an_imu_without_rate_and_samples_is_refused(tmp_path: Path) -> None:
     (root / "imu0" / "sensor.yaml").write_text(IMU_YAML.replace("rate_hz: 200\n", ""))
     table = root / "imu0" / "data.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
-    with pytest.raises(DataError, match="no file tells the IMU's rate, and it has 1 samples"):
+    with pytest.raises(DataError, match="no file states the IMU's rate, and it has 1 samples"):
         open_dataset(str(tmp_path))

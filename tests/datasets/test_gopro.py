@@ -209,7 +209,7 @@ def test_doctor_shows_imu_and_satellites(ride):
 
 def test_an_order_of_axes_that_nobody_tells_is_doubted(ride):
     gopro.add_telemetry(ride, payloads(told={}), [TICKS] * PAYLOADS)
-    assert "gyroscope: the order of its axes is not told (ORIN), HERO5's ZXY taken" in told(ride, "warning")
+    assert "gyroscope: the order of its axes is not stated (ORIN), HERO5's ZXY taken" in told(ride, "warning")
     named = gopro.write_video(ride.with_name("named.MP4"), 20)
     gopro.add_telemetry(named, payloads(told={"STNM": "Gyroscope (z,x,y)"}), [TICKS] * PAYLOADS)
     assert "ORIN" not in told(named, "warning")

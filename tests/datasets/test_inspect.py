@@ -80,7 +80,7 @@ def test_rates_units_and_clocks_that_do_not_fit(tmp_path: Path) -> None:
     rows = [f"{BEGIN_NS + 10**12 + i * 50_000_000},0,0,60.0,0,0,9.81" for i in range(30)]
     (root / "imu0" / "data.csv").write_text("#t\n" + "\n".join(rows) + "\n")
     result = inspect(str(tmp_path))
-    assert told(result, "warning", "imu0: 20.0 Hz, but its sensor file says 200.0 Hz")
+    assert told(result, "warning", "imu0: 20.0 Hz, but its sensor file states 200.0 Hz")
     assert told(result, "warning", "only 20 Hz of IMU")
     assert told(result, "error", "the unit seems to be deg/s")
     assert told(result, "error", "no frame lies within the time of the IMU")

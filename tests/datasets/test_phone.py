@@ -216,7 +216,7 @@ def test_a_stamp_without_a_unit_is_refused(tmp_path):
     folder = mars(tmp_path, "android")
     path = folder / "gyro_accel.csv"
     path.write_text(path.read_text().replace("Timestamp[nanosec]", "Timestamp"))
-    with pytest.raises(DataError, match=r"unit of the stamps is not told in 'Timestamp'; \[nanosec\] or \[sec\]"):
+    with pytest.raises(DataError, match=r"unit of the stamps is not stated in 'Timestamp'; \[nanosec\] or \[sec\]"):
         open_dataset(str(folder))
 
 

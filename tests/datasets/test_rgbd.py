@@ -218,4 +218,4 @@ def test_doctor_tells_of_saturated_depth_and_of_what_it_cannot_tell(tmp_path: Pa
         cv2.imwrite(str(path), raw)
     said = {finding.what: finding.severity for finding in inspect(str(folder)).findings}
     assert said["depth 65535 in 20.8% of the pixels means that nothing was measured"] == "warning"
-    assert any(what.startswith("colour and depth do not tell offset or lag or focal length") for what in said)
+    assert any(what.startswith("colour and depth do not show offset or lag or focal length") for what in said)

@@ -133,7 +133,7 @@ def test_samples_cross_the_wire_whole_and_in_order() -> None:
     hander, imu = ImuHander(ours), HandedImu(theirs, 200.0, LONG_S)
     with closing(imu):
         hander.send([sample(k) for k in range(100)])
-        hander.tell(Health.IMU_GAP | Health.IMU_MISSING, {"gaps": 1}, "")
+        hander.report(Health.IMU_GAP | Health.IMU_MISSING, {"gaps": 1}, "")
         read = imu.read(LONG_S)
         assert [value.t_ns for value in read] == [1000 * k for k in range(100)]
         assert isinstance(read[7], ImuSample)

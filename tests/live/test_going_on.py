@@ -107,7 +107,7 @@ def test_what_cannot_go_on_is_refused_before_anything_starts(interrupted, tmp_pa
     with pytest.raises(DataError, match="no session at"):
         in_map(MapChoice(tmp_path, False), ReplaySource(WORLD), settings())
     monkeypatch.setattr("vislam.live.beginning.time.monotonic_ns", lambda: 1)
-    with pytest.raises(UsageError, match="the machine was started anew"):
+    with pytest.raises(UsageError, match="the machine was restarted"):
         resumed(out, ReplaySource(WORLD), settings())
     assert resumed(tmp_path, ReplaySource(WORLD), settings()) is None
 

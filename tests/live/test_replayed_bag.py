@@ -70,7 +70,9 @@ def test_a_bag_is_played_as_its_folder_is(bag: Path, folder: Path, noise: str) -
 
 
 def test_the_noise_beside_a_bag_is_enough(bag: Path) -> None:
-    with pytest.raises(DataError, match=r"no bag tells how noisy its IMU \(/imu0\) is; give --calibration.imu-noise"):
+    with pytest.raises(
+        DataError, match=r"a bag does not state the noise of its IMU \(/imu0\); give --calibration.imu-noise"
+    ):
         opened(str(bag))
     bag.with_name("drive.imu.yaml").write_text(IMU_YAML)
     assert opened(str(bag)).imu_noise == opened(f"bag:{bag}").imu_noise is not None

@@ -73,7 +73,7 @@ def nees(fit: TruthFit, turn_rad: Array = TURN_RAD, lever_m: Array = LEVER_M, la
 @pytest.mark.parametrize(("seed", "truth_hz"), [(0, 100.0), (1, 20.0), (2, 200.0)])
 def test_a_turn_a_lever_and_a_clock_are_found_within_their_sigmas(seed: int, truth_hz: float) -> None:
     fit = fit_truth(*recorded(seed, truth_hz=truth_hz))
-    print(np.rad2deg(fit.turn_rad), fit.lever_m * 1e3, fit.time_offset_s * 1e3, nees(fit), fit.told)
+    print(np.rad2deg(fit.turn_rad), fit.lever_m * 1e3, fit.time_offset_s * 1e3, nees(fit), fit.summary)
     assert fit.is_turned and fit.is_displaced and fit.is_late
     assert max(nees(fit)[:2]) < 21.1 and nees(fit)[2] < 10.8  # 99.99 and 99.9 %
     assert np.linalg.norm(fit.turn_rad - TURN_RAD) < np.deg2rad(0.03)
@@ -100,7 +100,7 @@ def test_a_truth_that_fits_is_left_as_it_is() -> None:
     for seed in range(8):
         fit = fit_truth(*recorded(seed, np.zeros(3), np.zeros(3), 0.0, duration_s=40.0))
         changed.append((fit.is_turned, fit.is_displaced, fit.is_late))
-        if not fit.told:
+        if not fit.summary:
             truth = recorded(seed, np.zeros(3), np.zeros(3), 0.0, duration_s=40.0)[3]
             assert np.array_equal(fit.of_imu(truth).T_world_body, truth.T_world_body)
             assert np.array_equal(fit.of_imu(truth).t_ns, truth.t_ns)
@@ -112,9 +112,9 @@ def test_what_is_found_is_undone() -> None:
     stamps, gyro, accel, truth = recorded(3)
     fit = fit_truth(stamps, gyro, accel, truth)
     again = fit_truth(stamps, gyro, accel, fit.of_imu(truth))
-    print(fit.told, "then", again.told)
-    assert "turned by 0.3" in fit.told and "mm" in fit.told and "+5.0" in fit.told
-    assert again.told == ""
+    print(fit.summary, "then", again.summary)
+    assert "turned by 0.3" in fit.summary and "mm" in fit.summary and "+5.0" in fit.summary
+    assert again.summary == ""
 
 
 def test_gaps_in_truth_and_in_samples_do_no_harm() -> None:
@@ -124,7 +124,7 @@ def test_gaps_in_truth_and_in_samples_do_no_harm() -> None:
     imu_kept = np.abs((stamps - stamps[0]) * 1e-9 - 20.0) > 0.05
     holed = Trajectory(truth.t_ns[kept], truth.T_world_body[kept])
     fit = fit_truth(stamps[imu_kept], gyro[imu_kept], accel[imu_kept], holed)
-    print(fit.told)
+    print(fit.summary)
     assert np.linalg.norm(fit.turn_rad - TURN_RAD) < np.deg2rad(0.05)
     assert np.linalg.norm(fit.lever_m - LEVER_M) < 0.003
     assert abs(fit.time_offset_s - LATE_S) < 4e-4
@@ -133,13 +133,13 @@ def test_gaps_in_truth_and_in_samples_do_no_harm() -> None:
 def test_a_body_that_does_not_move_tells_nothing_and_nothing_is_claimed() -> None:
     stamps, gyro, accel, truth = recorded(5, brisk=0.0)
     fit = fit_truth(stamps, gyro, accel, truth)
-    assert fit.told == ""
+    assert fit.summary == ""
     assert np.sqrt(np.linalg.eigvalsh(fit.lever_covariance)[-1]) > 0.02 and fit.time_offset_sigma_s > 0.005
     short = Trajectory(truth.t_ns[:30], truth.T_world_body[:30])
     for nothing in (short, Trajectory(truth.t_ns[:0], truth.T_world_body[:0])):
         fit = fit_truth(stamps, gyro, accel, nothing)
-        assert fit.told == "" and np.array_equal(fit.of_imu(nothing).t_ns, nothing.t_ns)
-    assert fit_truth(stamps[:0], gyro[:0], accel[:0], truth).told == ""
+        assert fit.summary == "" and np.array_equal(fit.of_imu(nothing).t_ns, nothing.t_ns)
+    assert fit_truth(stamps[:0], gyro[:0], accel[:0], truth).summary == ""
 
 
 def test_the_same_data_give_the_same_fit() -> None:
@@ -154,7 +154,7 @@ def test_on_a_real_flight_the_turn_is_found_and_undone(data_root: Path) -> None:
     if not folder.is_dir():
         missing(f"{folder}")
     data = measured_inertial(real(data_root, "v202").removeprefix("points:"))
-    print(data.truth_fit.told)
+    print(data.truth_fit.summary)
     assert data.truth_fit.is_turned and not data.truth_fit.is_displaced
     assert 0.4 < np.rad2deg(np.linalg.norm(data.truth_fit.turn_rad)) < 0.8
-    assert fit_truth(data.t_ns, data.gyro_rad_s, data.accel_m_s2, data.truth).told == ""
+    assert fit_truth(data.t_ns, data.gyro_rad_s, data.accel_m_s2, data.truth).summary == ""

@@ -55,7 +55,7 @@ def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Reco
 def survey(uri: str) -> Survey:
     """Return what `FORMAT:PATH` or a bare path holds, for `open_dataset` and `vislam doctor`; raises as it does.
 
-    A bag's topics may be told behind it: `bag:PATH,cam0=/left/image_raw,imu=/imu`; of a film `chapters=one`.
+    A bag's topics may be given behind it: `bag:PATH,cam0=/left/image_raw,imu=/imu`; of a film `chapters=one`.
     """
     name, path, options = _split(uri)
     try:
@@ -63,9 +63,9 @@ def survey(uri: str) -> Survey:
         if not options:
             return reader.survey(path)
         if reader is bags:
-            return bags.survey_with(path, _told(uri, options))
+            return bags.survey_with(path, _options(uri, options))
         if reader is video:
-            return video.survey_with(path, _told(uri, options))
+            return video.survey_with(path, _options(uri, options))
         raise UsageError(f"'{options}' in {uri}: only a bag or a film takes options, and {path} is none")
     except OSError as error:  # a folder that may not be entered, a disk that fails
         raise DataError(f"{error.filename or path} cannot be read: {error.strerror or error}") from error
@@ -108,7 +108,7 @@ def _path_and_options(text: str) -> tuple[Path, str]:
     return Path(first), options
 
 
-def _told(uri: str, options: str) -> dict[str, str]:
+def _options(uri: str, options: str) -> dict[str, str]:
     parts = options.split(",")
     if wrong := [part for part in parts if "=" not in part]:
         raise UsageError(f"'{wrong[0]}' in {uri} is no option; write bag:PATH,cam0=/topic,imu=/topic")

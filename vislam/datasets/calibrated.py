@@ -48,7 +48,7 @@ def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
 
 
 def with_imu_rate(found: Survey) -> Survey:
-    """Return what a recording holds, with the usual rate of its first inertial samples where no file tells it.
+    """Return what a recording holds, with the usual rate of its first inertial samples where no file states it.
 
     Raises DataError where there are not two of them.
     """
@@ -58,7 +58,7 @@ def with_imu_rate(found: Survey) -> Survey:
     steps_ns = np.diff(np.array(stamps, dtype=np.int64))
     steps_ns = steps_ns[steps_ns > 0]
     if len(steps_ns) == 0:
-        raise DataError(f"{found.root}: no file tells the IMU's rate, and it has {len(stamps)} samples; write rate_hz")
+        raise DataError(f"{found.root}: no file states the IMU's rate, and it has {len(stamps)} samples; write rate_hz")
     return replace(found, imu_noise=replace(found.imu_noise, rate_hz=1e9 / float(np.median(steps_ns))))
 
 
@@ -71,7 +71,7 @@ def joined_rig(known: Sequence[KnownCamera], has_depth: bool) -> Rig | None:
 
 
 def with_clock(config: Config) -> Config:
-    """Return the settings with the time offset that the camera's calibration file tells, unless they have their own."""
+    """Return the settings with the time offset of the camera's calibration file, unless they have their own."""
     if config.calibration.camera is None or config.init.time_offset_s != 0.0:
         return config
     first = read_cameras(Path(config.calibration.camera))[0]
@@ -85,12 +85,12 @@ def with_clock(config: Config) -> Config:
 
 
 def _with_depth(found: Survey, path: Path) -> Survey:
-    """Return what a recording holds, with its depth read as the camera's file says, where that says anything."""
+    """Return what a recording holds, with its depth read as the camera's file states, if it does."""
     said = parse_depth(load_yaml(path), path)
     if said == DepthFile() or found.depth is None:
         return found
     if found.streams is not None:
-        raise DataError(f"{path} tells how depth is read, which a bag's messages say themselves; leave depth_... out")
+        raise DataError(f"{path} states how depth is read, which a bag's messages state already; leave depth_... out")
     return with_depth_format(found, said.over(found.depth_format))
 
 
@@ -111,7 +111,7 @@ def _completed_rig(found: Survey, path: Path) -> Rig:
     rig = joined_rig(joined, found.depth is not None)
     if rig is None:
         missing = next(k for k, one in enumerate(joined) if one.T_body_cam is None)
-        raise DataError(f"{path} does not tell where cam{missing} sits, nor does the recording: it needs T_cam_imu")
+        raise DataError(f"{path} does not state where cam{missing} sits, nor does the recording: it needs T_cam_imu")
     return rig
 
 

@@ -46,7 +46,7 @@ CAMERA_EXAMPLE = (
 
 @dataclass(frozen=True, slots=True)
 class DepthFile:
-    """What a sensor file says of depth images; None where it says nothing."""
+    """What a sensor file states of depth images; None where it states nothing."""
 
     units_per_m: float | None = None
     invalid: tuple[int, ...] | None = None
@@ -54,14 +54,14 @@ class DepthFile:
     time_offset_s: float | None = None
 
     def over(self, how: DepthFormat) -> DepthFormat:
-        """Return `how`, with what the file says in its place."""
+        """Return `how`, with what the file states in its place."""
         said = {key: value for key, value in asdict(self).items() if value is not None}
         return replace(how, **said)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFile:
-    """What a camera's sensor file says."""
+    """What a camera's sensor file states."""
 
     camera: Camera
     T_body_cam: Array  # [4, 4]
@@ -137,7 +137,7 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
 
 
 def parse_depth(data: Mapping[str, Any], path: Path) -> DepthFile:
-    """Return what a sensor file says of depth images; raises DataError naming the key."""
+    """Return what a sensor file states of depth images; raises DataError naming the key."""
     invalid = offset_px = time_offset_s = None
     if data.get("depth_invalid") is not None:
         invalid = tuple(int(value) for value in numbers_in(data, "depth_invalid", path))
@@ -227,7 +227,7 @@ def pose_text(T: Array) -> str:
 
 
 def camera_text(camera: Camera, T_body_cam: Array | None, comment: str) -> str:
-    """Return the sensor file of a camera; without a pose it says none."""
+    """Return the sensor file of a camera; without a pose it has none."""
     pose = "" if T_body_cam is None else pose_text(T_body_cam)
     return (
         f"sensor_type: camera\ncomment: {json.dumps(comment)}\n{pose}"

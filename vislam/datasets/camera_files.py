@@ -32,7 +32,7 @@ _RIGID = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """What a file says of one camera."""
+    """What a file states of one camera."""
 
     camera: Camera
     T_body_cam: Array | None = None  # [4, 4], body is the IMU

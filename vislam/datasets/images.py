@@ -24,7 +24,7 @@ Stamps = NDArray[np.int64]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-_MAX_PIXELS = 100_000_000  # of an image whose size nobody told; more is no camera's
+_MAX_PIXELS = 100_000_000  # of an image of unknown size; more is no camera's
 NO_DEPTH = 65535  # saturated: no sensor measures it, and several write it for "nothing measured"
 MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
 _SHORT_HEAD_BYTES = 2**12  # holds the size of most images
@@ -204,7 +204,7 @@ def read_grey_or_color(path: Path, camera: Camera) -> tuple[ImageU8, ImageU8 | N
 
 
 def read_any_size(path: Path) -> ImageU8 | None:
-    """Return a grey image of whatever size its file says; None if it cannot be read, or is larger than any camera's."""
+    """Return a grey image of whatever size its file has; None if it cannot be read, or is larger than any camera's."""
     try:
         width, height = probe(path)
         if width * height > _MAX_PIXELS:

@@ -1,7 +1,7 @@
 """Calibrations of inertial and magnetic sensors in YAML: Kalibr's imu.yaml, and our keys for scale, axes and bias.
 
 Our keys may stand in a file of their own (as `vislam calibrate imu` writes it) or in a recording's `sensor.yaml`, which
-says that its samples are raw; docs/formats.md lists them.
+states that its samples are raw; docs/formats.md lists them.
 """
 
 from __future__ import annotations

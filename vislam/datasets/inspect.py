@@ -51,7 +51,7 @@ _REST_TOLERANCE_M_S2 = 0.3  # bias and scale of a cheap accelerometer
 _MOVING_TOLERANCE_M_S2 = 1.0  # what an honest journey may average to
 _MAX_TILT_RAD = np.deg2rad(60.0)
 _MIN_IMU_RATE_HZ = 50.0  # below it, preintegration between frames of 20 Hz has next to nothing to integrate
-_DECODED_PER_CAMERA = 200  # each image's head and end are read, and so many, spread evenly, are decoded
+_DECODED_PER_CAMERA = 200  # each image's head and end are read; this many, spread evenly, are decoded
 _CHECKED_PAIRS = 6
 _CHECKED_TURNS = 12
 _MIN_TURNS = 3
@@ -167,7 +167,7 @@ class _Inspector:
             what = f"{name}: {100 * late:.0f} % of the intervals are over 1.5 periods"
             self._add("warning", what, name, "samples were dropped or stamped late; record at a lower load")
         if declared_hz and abs(rate_hz / declared_hz - 1.0) > 0.1:
-            what = f"{name}: {rate_hz:.1f} Hz, but its sensor file says {declared_hz:.1f} Hz"
+            what = f"{name}: {rate_hz:.1f} Hz, but its sensor file states {declared_hz:.1f} Hz"
             self._add("warning", what, name, "correct rate_hz")
         elif len(steps_s):
             self._add("ok", f"{name}: {len(t_ns)} at {rate_hz:.1f} Hz, longest gap {longest:.3f} s", name)
@@ -189,7 +189,7 @@ class _Inspector:
             self._add("error", "no frame: the cameras share no stamps", str(found.root), "synchronise the cameras")
 
     def _check_images(self, images: ImageList, camera: Camera | None, is_depth: bool) -> None:
-        """Probe every image, decode some, and tell which cannot be used."""
+        """Probe every image, decode some, and report which cannot be used."""
         bad: dict[str, list[Path]] = {}
         stride = max(1, len(images.files) // _DECODED_PER_CAMERA)
         decoded = 0
@@ -346,17 +346,17 @@ class _Inspector:
             self._add("warning", tilt, "cam0", step)
 
     def _check_truth_fit(self, truth: Trajectory) -> None:
-        """Tell what the truth's body is turned, displaced and late against the IMU."""
+        """Report by how much the truth's body is turned, displaced and late against the IMU."""
         if not self._found.has_imu:
             return
         try:
             rows = list(self._rows(Problems()))
         except DataError:
-            return  # told by the check of the IMU
+            return  # reported by the check of the IMU
         values = np.array([row[1] for row in rows]).reshape(-1, 6)
         fit = fit_truth(np.array([row[0] for row in rows], dtype=np.int64), values[:, :3], values[:, 3:], truth)
-        if fit.told:
-            self._add("ok", f"{fit.told}; `points:` undoes it", "truth")
+        if fit.summary:
+            self._add("ok", f"{fit.summary}; `points:` undoes it", "truth")
 
     def _check_truth(self, frames: FrameTable | None) -> None:
         if self._found.truth is None:
@@ -377,7 +377,7 @@ class _Inspector:
 
 
 def _message_findings(found: Survey, frames: FrameTable) -> list[Finding]:
-    """Decode some frames of a bag, evenly spread, and tell which cannot be used."""
+    """Decode some frames of a bag, evenly spread, and report which cannot be used."""
     rig = found.rig or _rig_of_first_sizes(found)
     if rig is None or not len(frames.t_ns):
         return []
@@ -402,7 +402,7 @@ def _message_findings(found: Survey, frames: FrameTable) -> list[Finding]:
 
 
 def _rig_of_first_sizes(found: Survey) -> Rig | None:
-    """Return a rig that only says the sizes of the images, where there is no calibration yet; None without lenses."""
+    """Return a rig that only has the sizes of the images, where there is no calibration yet; None without lenses."""
     lenses = [known.camera for known in found.known_cameras if known.camera is not None]
     whole = len(lenses) == len(found.cameras) > 0
     return Rig(tuple(lenses), tuple(np.eye(4) for _ in lenses), found.depth is not None) if whole else None

@@ -31,7 +31,7 @@ _MATCH_RATIO = 0.8
 _EPIPOLAR_LIMIT_PX = 2.0
 _INLIER_PX = 1.5
 _TURN_SPAN_NS = 200_000_000
-_MIN_TURN_RAD = np.deg2rad(3.0)  # a smaller turn tells little beside bias and noise of a few tracks
+_MIN_TURN_RAD = np.deg2rad(3.0)  # a smaller turn shows little beside bias and noise of a few tracks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def imu_facts(rows: Iterable[Row[list[float]]]) -> ImuFacts:
 
 
 def mean_force(facts: ImuFacts) -> tuple[float, bool]:
-    """Return the mean specific force in whatever unit it is told, and whether that is at rest, not on average."""
+    """Return the mean specific force in whatever unit it is given, and whether that is at rest, not on average."""
     rest = bool(facts.at_rest.any())
     if rest:
         return float(np.linalg.norm(facts.accel_mean[facts.at_rest], axis=1).mean()), True

@@ -293,7 +293,7 @@ class _RowLog:
         data = row.encode("utf-8") + b"\n"
         try:
             written = self._file.write(data)
-            if written != len(data):  # the disk took a part: the next attempt tells why
+            if written != len(data):  # the disk took a part: the next attempt shows why
                 self._file.write(data[written or 0 :])
                 written = self._file.seek(0, os.SEEK_CUR) - self._size
                 if written != len(data):
@@ -320,7 +320,7 @@ def record(
 ) -> Recorder:
     """Write a whole recording with its truth into a new ASL folder and return the closed recorder.
 
-    `on_frame` is told how many frames are written, after each. The recording is there whole or not at all. Raises
+    `on_frame` gets the number of frames written, after each. The recording is there whole or not at all. Raises
     UsageError, DataError and StorageError as `Recorder` does.
     """
     comment = f"vislam, {recording.name}"

@@ -60,7 +60,7 @@ def sensor_readings(name: str, sensor: Configured, file: SensorFile, problems: P
 def local_frame(file: SensorFile) -> LocalFrame:
     """Return the frame of a receiver's file, to turn east, north, up back into latitude, longitude, height.
 
-    Its datum is the one that was told, or the first fix that is good enough. Raises DataError where there is none.
+    Its datum is the one that was given, or the first fix that is good enough. Raises DataError where there is none.
     """
     made = FixReadings("", file.gnss)
     if made.frame is None and file.format == "bag":
@@ -70,7 +70,7 @@ def local_frame(file: SensorFile) -> LocalFrame:
     if made.frame is None and file.format in _FIXES:
         next(_FIXES[file.format](made, file, Problems()), None)
     if made.frame is None:
-        raise DataError(f"{file.path}: no datum is told and no fix is good enough to be one")
+        raise DataError(f"{file.path}: no datum is given and no fix is good enough to be one")
     return made.frame
 
 
@@ -83,8 +83,8 @@ def _table(name: str, sensor: Configured, file: SensorFile, problems: Problems) 
         values = np.array(numbers[: len(sensor.columns)])
         if not has_sigmas:
             yield Reading(name, t_ns, values)
-        elif min(told := numbers[len(sensor.columns) :]) > 0.0:
-            by_name = dict(zip(sigmas, told, strict=True))
+        elif min(given := numbers[len(sensor.columns) :]) > 0.0:
+            by_name = dict(zip(sigmas, given, strict=True))
             yield Reading(name, t_ns, values, _diagonal([by_name[column] for column in sensor.sigma_columns]))
         else:
             problems.count(f"{file.path.parent.name}/{file.path.name}: rows with a sigma that is not positive")

@@ -35,9 +35,9 @@ from vislam.trajectory import Trajectory
 
 STEREO_TOLERANCE_NS = 2_000_000  # at 1 m/s the body moves 2 mm in it, far less than any baseline
 DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
-_FRAME_GAP_S = 0.5  # a hole in the images that is worth telling, unless frames are rarer anyway
+_FRAME_GAP_S = 0.5  # a hole in the images that is worth reporting, unless frames are rarer anyway
 _USUAL_PERIODS = 3.5  # a hole is longer than this many usual periods
-_NAMED_GAPS = 5  # so many gaps are told one by one
+_NAMED_GAPS = 5  # gaps reported one by one
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class TopicSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """What a recording says of one camera, None where it does not."""
+    """What a recording states of one camera, None where it does not."""
 
     camera: Camera | None = None
     T_body_cam: Array | None = None  # [4, 4]
@@ -84,7 +84,7 @@ class Streams(Protocol):
         ...
 
     def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> Loader:
-        """Return what loads the images of frames, of the first `cameras` only if told."""
+        """Return what loads the images of frames, of the first `cameras` only if given."""
         ...
 
 
@@ -102,7 +102,7 @@ class Survey:
     rig: Rig | None = None
     imu_file: Path | None = None
     samples: ImuRows | None = None  # inertial ones, where there is no table of them
-    findings: tuple[Finding, ...] = ()  # what doctor tells of its parts
+    findings: tuple[Finding, ...] = ()  # what doctor reports of its parts
     imu_noise: ImuNoise | None = None
     imu_calibration: ImuCalibration | None = None  # of raw samples; None: they are calibrated
     mag_file: Path | None = None
@@ -184,7 +184,7 @@ def _unpaired(partners: NDArray[np.int64], others: int) -> int:
 
 
 def open_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | None = None) -> Loader:
-    """Return what loads the frames of a survey, of its first `cameras` only if told; close it after use.
+    """Return what loads the frames of a survey, of its first `cameras` only if given; close it after use.
 
     Raises DataError when a video cannot be opened.
     """
@@ -210,7 +210,7 @@ class FileRecording:
         self.name = survey.root.resolve().name
         self.rig: Rig = survey.rig
         self.imu_noise: ImuNoise | None = survey.imu_noise
-        self.cameras_read = len(survey.cameras)  # fewer, where nobody looks at the images of the others
+        self.cameras_read = len(survey.cameras)  # fewer, where the images of the others are not needed
         self._survey = survey
         self._counter = Problems()
         self._counter.update(survey.problems)
@@ -333,18 +333,18 @@ def imu_gap_limit_s(rate_hz: float) -> float:
 
 
 class _GapWatch:
-    """Tells gaps of one stream: the first few one by one, the others as a count."""
+    """Reports gaps of one stream: the first few one by one, the others as a count."""
 
     def __init__(self, what: str, limit_s: float, problems: Problems) -> None:
         self._what = what
         self._limit_ns = round(limit_s * 1e9)
         self._problems = problems
         self._last_ns: int | None = None
-        self._told = 0
+        self._reported = 0
 
     def see(self, t_ns: int) -> None:
         if self._last_ns is not None and t_ns - self._last_ns > self._limit_ns:
-            self._told += 1
+            self._reported += 1
             gap = f"{self._what} gap of {(t_ns - self._last_ns) * 1e-9:.2f} s at t={self._last_ns * 1e-9:.3f} s"
-            self._problems.count(gap if self._told <= _NAMED_GAPS else f"further {self._what} gaps")
+            self._problems.count(gap if self._reported <= _NAMED_GAPS else f"further {self._what} gaps")
         self._last_ns = t_ns

@@ -22,7 +22,7 @@ MAX_LINE_BYTES = 4096  # the longest line of any supported table is far shorter;
 MAX_FILE_BYTES = 2**30  # of tables that are indexed in memory: 4 days of images at 30 Hz
 _MAX_STAMP_NS = 2**62
 _ENOUGH_ROWS = 20  # below this many rows, one bad line in two is not yet "mostly unusable"
-_MANY_ROWS = 1000  # so many bad rows, and more than good ones, settle it
+_MANY_ROWS = 1000  # bad rows, and more than good ones, settle it
 _LEAP_NS = 1_000_000_000  # a stamp that leaps further ahead than this, and back in the next row, is the wrong one
 
 

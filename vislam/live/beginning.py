@@ -25,7 +25,7 @@ class Beginning:
     first_id: int  # of the new keyframes
     next_track_id: int
     held: int  # keyframes that are not to move
-    T_guess: Array | None = None  # [4, 4] where the body is thought to be in the map, if somebody said so
+    T_guess: Array | None = None  # [4, 4] where the body is assumed to be in the map, if a pose was given
 
 
 def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
@@ -41,7 +41,7 @@ def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
 def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None:
     """Return the beginning of a run that goes on in its folder; None where it had nothing yet to go on from.
 
-    Raises UsageError when its sensors are others now, or the machine was started anew, DataError when its session is
+    Raises UsageError when its sensors are others now, or the machine was restarted, DataError when its session is
     damaged.
     """
     path = out / "session.db"
@@ -57,7 +57,7 @@ def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None
         stored.close()
     if memory.front.t_ns >= time.monotonic_ns():
         raise UsageError(
-            f"the machine was started anew since {out} was recorded, and its clock begins again; start a new run in "
+            f"the machine was restarted since {out} was recorded, and its clock begins again; start a new run in "
             f"that map: vislam live --map {out} --out NEW"
         )
     return _of(memory, path, is_own=True)

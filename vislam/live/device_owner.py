@@ -47,14 +47,14 @@ def own_device(life: Life, name: str, sensors: SensorsConfig, memory: str, sampl
             imu.health()
             _LOG.info("%s: images are stamped by %s; its IMU's samples by %s", name, camera.stamped_by, imu.stamped_by)
             frames = _Frames(camera, handed)
-            told_s, problem = 0.0, ""
+            reported_s, problem = 0.0, ""
             try:
                 while not life.stopped:
                     hander.send(imu.read(_READ_S))
-                    if time.monotonic() - told_s > _TELL_S:
-                        told_s = time.monotonic()
-                        problem = _told(name, problem, camera.problem)
-                        hander.tell(imu.health(), imu.counters(), problem)
+                    if time.monotonic() - reported_s > _TELL_S:
+                        reported_s = time.monotonic()
+                        problem = _report_change(name, problem, camera.problem)
+                        hander.report(imu.health(), imu.counters(), problem)
             finally:
                 frames.end()
     finally:
@@ -62,8 +62,8 @@ def own_device(life: Life, name: str, sensors: SensorsConfig, memory: str, sampl
         handed.close()
 
 
-def _told(name: str, before: str, problem: str) -> str:
-    """Say that a device went away, why it does not come back, or that it has; return what ails it."""
+def _report_change(name: str, before: str, problem: str) -> str:
+    """Log that a device went away, why it does not come back, or that it has; return its problem."""
     if problem and problem != before:
         _LOG.warning("%s: %s", name, problem)
     elif before and not problem:
@@ -86,13 +86,13 @@ class _Frames:
         self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
-        told_s = time.monotonic()
+        reported_s = time.monotonic()
         while not self._is_ending.is_set():
             frame = self._camera.read(_READ_S)
             now_s = time.monotonic()
             if frame is not None:
-                told_s = now_s
+                reported_s = now_s
                 self._handed.hand(frame, self._camera.counters())
-            elif now_s - told_s > _TELL_FRAMES_S:
-                told_s = now_s
-                self._handed.tell(self._camera.counters())
+            elif now_s - reported_s > _TELL_FRAMES_S:
+                reported_s = now_s
+                self._handed.report(self._camera.counters())

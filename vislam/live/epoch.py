@@ -30,5 +30,5 @@ class Epoch:
             return int(self._value.value)
 
     def peek_ns(self) -> int:
-        """Return when it begins, 0 while nobody has asked."""
+        """Return when it begins, 0 before the first call of `now`."""
         return int(self._value.value)

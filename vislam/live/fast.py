@@ -38,7 +38,7 @@ BaseState = tuple[Array, Array, Array, Array, Array]  # pose, velocity, rate, co
 
 
 class FastPath:
-    """Owns the filter that is published. One thread; no clock: whoever calls says what time it is."""
+    """Owns the filter that is published. One thread; no clock: the caller passes the time."""
 
     def __init__(
         self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None],
@@ -48,7 +48,7 @@ class FastPath:
 
         Args:
             config: `live`, `ekf`, `init`, `imu`, `power_up` and `attitude` of it are used.
-            noise: of the IMU, until vision's side tells what the samples show.
+            noise: of the IMU, until the front process sends what the samples show.
             T_body_camera: [4, 4] of the first camera.
             publish: takes each pose.
             memory: gyro biases that earlier power-ups found; None: none.
@@ -110,7 +110,7 @@ class FastPath:
         }
 
     def add(self, value: ImuSample | MagSample) -> Hint | None:
-        """Take a sample; return what vision's filter has to be told of it besides."""
+        """Take a sample; return what the filter of the front process needs besides."""
         if isinstance(value, MagSample):
             if self._is_mag_calibrated:
                 self._alone.add_field(value)
@@ -125,7 +125,7 @@ class FastPath:
         return self._look_for_rest(value.t_ns)
 
     def power_up(self, temperature_c: float | None) -> PowerUp | None:
-        """Look whether the cart stands as it has to at power-up; return what that told, once.
+        """Look whether the cart stands as it has to at power-up; return the result, once.
 
         With vision already there only while the body rests. Called twice a second: it takes a third of a millisecond.
         """
@@ -138,7 +138,7 @@ class FastPath:
 
     def power_up_report(self) -> dict[str, Any]:
         """Return the zero that was found, or why none was."""
-        return self._alone.told()
+        return self._alone.report()
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
@@ -266,8 +266,8 @@ class FastPath:
     def _look_for_rest(self, t_ns: int) -> Hint | None:
         """Hold the drift while vision is away: by rest, or by wheels where `machine.slip_sigma_m_s` is set.
 
-        Still inertial data mean rest where the filter itself sees no speed: an IMU alone cannot tell rest from uniform
-        motion, so a filter that is not sure of its speed is not told.
+        Still inertial data mean rest where the filter itself sees no speed: an IMU alone cannot distinguish rest from
+        uniform motion, so rest is not assumed while the filter is unsure of its speed.
         """
         if self._rest_t_ns is None:
             self._rest_t_ns = t_ns

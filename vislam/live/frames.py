@@ -15,7 +15,7 @@ from vislam.hw.source import ImageSource
 
 
 class FrameSource(Protocol):
-    """Cameras of a rig that keep their newest frame only; the frame's index tells how many were dropped."""
+    """Cameras of a rig that keep their newest frame only; gaps in the frame's index count what was dropped."""
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the newest frame not yet returned, waiting at most `timeout_s`; None if none came."""
@@ -76,7 +76,7 @@ class NoCamera:
         return None
 
     def health(self) -> Health:
-        """Return nothing: a camera that nobody asked for is not missing."""
+        """Return nothing: a camera that was not asked for is not missing."""
         return Health(0)
 
     def counters(self) -> dict[str, int]:

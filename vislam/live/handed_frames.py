@@ -36,20 +36,20 @@ class FrameHander:
         images = frame.images if frame.color is None else (frame.color,)  # grey is made of colour again
         arrays = [*images, *(() if frame.depth_m is None else (frame.depth_m,))]
         greys = len(frame.images) if frame.color is None else 0
-        told = self._words(counters)
-        shape = height, width, greys, frame.color is not None, frame.depth_m is not None, len(told)
+        words = self._words(counters)
+        shape = height, width, greys, frame.color is not None, frame.depth_m is not None, len(words)
         head = _HEAD.pack(frame.t_ns, frame.index, *shape)
-        data = head + told + b"".join(array.tobytes() for array in arrays)
+        data = head + words + b"".join(array.tobytes() for array in arrays)
         if len(data) > self._capacity:
             self._wrong_size += 1
-            self.tell(counters)
+            self.report(counters)
         else:
             self._slot.write(data)
 
-    def tell(self, counters: dict[str, int]) -> None:
+    def report(self, counters: dict[str, int]) -> None:
         """Replace the counters, while no frame comes."""
-        told = self._words(counters)
-        self._slot.write(_HEAD.pack(0, 0, 0, 0, 0, 0, 0, len(told)) + told)
+        words = self._words(counters)
+        self._slot.write(_HEAD.pack(0, 0, 0, 0, 0, 0, 0, len(words)) + words)
 
     def close(self) -> None:
         """Remove the memory."""
@@ -63,7 +63,7 @@ class HandedFrames:
     """Satisfies `FrameSource` with what a `FrameHander` of another process writes."""
 
     def __init__(self, name: str, missing_s: float) -> None:
-        """Wait for the memory. Raises DataError when nobody makes it.
+        """Wait for the memory. Raises DataError when it does not appear.
 
         Args:
             name: of the memory.
@@ -95,7 +95,7 @@ class HandedFrames:
         return Health.CAMERA_MISSING if missing else Health(0)
 
     def counters(self) -> dict[str, int]:
-        """Return those that the device's process told last, and frames replaced before they were read."""
+        """Return those that the device's process reported last, and frames replaced before they were read."""
         return {"captured": 0, **self._told, "replaced": self._replaced, "taken": self._taken}
 
     def close(self) -> None:
@@ -104,8 +104,8 @@ class HandedFrames:
 
     def _unpacked(self, data: bytearray) -> Frame | None:
         """Return the frame of memory that may be written to, as all cameras give; None for counters alone."""
-        t_ns, index, height, width, greys, has_color, has_depth, told = _HEAD.unpack_from(data)
-        at = _HEAD.size + told
+        t_ns, index, height, width, greys, has_color, has_depth, words = _HEAD.unpack_from(data)
+        at = _HEAD.size + words
         self._told = json.loads(bytes(data[_HEAD.size : at]))
         if not height:
             return None

@@ -31,7 +31,7 @@ class ImuHander:
         sock.setblocking(False)
         self._socket = sock
         self._waiting: deque[bytes] = deque()
-        self.lost = 0  # messages that nobody took in time
+        self.lost = 0  # messages that were not taken in time
 
     def send(self, samples: Iterable[ImuSample | MagSample]) -> None:
         """Hand samples on; those that a stuck reader leaves lying for too long are lost and counted."""
@@ -44,10 +44,10 @@ class ImuHander:
             self._put(_SAMPLES + b"".join(rows[first : first + _BATCH]))
         self._flush()
 
-    def tell(self, health: Health, counters: dict[str, int], problem: str) -> None:
+    def report(self, health: Health, counters: dict[str, int], problem: str) -> None:
         """Hand on how the device is."""
-        told = {"health": int(health), "counters": {**counters, "not_handed_on": self.lost}, "problem": problem[:1000]}
-        self._put(_WORD + json.dumps(told).encode())
+        state = {"health": int(health), "counters": {**counters, "not_handed_on": self.lost}, "problem": problem[:1000]}
+        self._put(_WORD + json.dumps(state).encode())
         self._flush()
 
     def close(self) -> None:
@@ -124,7 +124,7 @@ class HandedImu:
         return word | (Health.IMU_MISSING if is_silent else Health(0))
 
     def counters(self) -> dict[str, int]:
-        """Return those that the device's process told last."""
+        """Return those that the device's process reported last."""
         return dict(self._counts)
 
     def close(self) -> None:
@@ -145,8 +145,8 @@ class HandedImu:
                 for t_ns, *numbers in _RECORD.iter_unpack(rest):
                     samples.append(ImuSample(t_ns, np.array(numbers[:3]), np.array(numbers[3:])))
             elif kind == _WORD:
-                told = json.loads(rest)
-                self._events |= Health(told["health"]) & ~Health.IMU_MISSING  # which is looked at here
-                self._counts = told["counters"]
+                state = json.loads(rest)
+                self._events |= Health(state["health"]) & ~Health.IMU_MISSING  # which is looked at here
+                self._counts = state["counters"]
             else:
                 self._is_over = True

@@ -28,7 +28,7 @@ class KeyframeOut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BackBegun:
-    """The back process has taken over an earlier session and reads it no more; the first thing that it tells then."""
+    """The back process has taken over an earlier session and reads it no more; the first message after that."""
 
     update: GraphUpdate  # all poses
 
@@ -69,7 +69,7 @@ class EndedGraph:
         return self.own_variables.get(name)
 
     def sensed(self, name: str) -> dict[str, int]:
-        """Return what became of the readings of a further sensor; empty where nobody knows."""
+        """Return what became of the readings of a further sensor; empty where that is unknown."""
         return self.readings.get(name, {})
 
     def poses(self) -> Array:

@@ -24,7 +24,7 @@ class InertialOnly:
     The attitude is the baseline without vision; it ends when vision has a state, which knows all of it better.
 
     Attributes:
-        zero: what standing still told; None until it did.
+        zero: what standing still has shown; None until then.
         refusal: why there is no zero, when last tried.
     """
 
@@ -55,7 +55,7 @@ class InertialOnly:
         return self._attitude is not None
 
     def look(self, buffer: ImuBuffer, temperature_c: float | None) -> PowerUp | None:
-        """Return the zero if the newest samples are the first that give one; else `refusal` says why there is none."""
+        """Return the zero if the newest samples are the first that give one; else `refusal` is the reason why not."""
         newest_ns = buffer.newest_t_ns
         if self.zero is not None or newest_ns is None or buffer.oldest_t_ns is None:
             return None
@@ -121,8 +121,8 @@ class InertialOnly:
             np.diag([*unknown, *rate_variance]),
         )  # fmt: skip
 
-    def told(self) -> dict[str, Any]:
-        """Return what a person, or the next power-up, wants to know of the zero."""
+    def report(self) -> dict[str, Any]:
+        """Return the zero, or why there is none, for people and the next power-up, as JSON has it."""
         if self.zero is None:
             return {"refused": self.refusal}
         facts = asdict(self.zero)

@@ -29,13 +29,13 @@ class KeptBias:
         self.refusal: str | None = None
         self._is_kept = False
 
-    def take(self, told: dict[str, Any]) -> None:
-        """Keep the bias that power-up tells of, once, if it found one."""
-        temperature_c = told.get("temperature_c")
+    def take(self, report: dict[str, Any]) -> None:
+        """Keep the bias that power-up reports, once, if it found one."""
+        temperature_c = report.get("temperature_c")
         if self._path is None or self._is_kept or temperature_c is None:
             return
         self._is_kept = True
-        self.memory.add(temperature_c, np.array(told["gyro_bias_rad_s"]))
+        self.memory.add(temperature_c, np.array(report["gyro_bias_rad_s"]))
         try:
             self.memory.write(self._path)
         except StorageError as error:

@@ -1,4 +1,4 @@
-"""What the processes tell each other, beside measurements. Plain values; nothing here loads a heavy package."""
+"""Messages between the processes, beside measurements. Plain values; nothing here loads a heavy package."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Rebase:
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth:
-    """What the camera says of itself, when it changes."""
+    """Counters of the camera, when they change."""
 
     health: Health
 

@@ -18,15 +18,15 @@ _MOST_DROPPED = 0.1  # of the frames of a window
 _LIGHT = 0.35  # of a window that work may take so that twice the frames fit, with a margin
 _LIGHT_WINDOWS = 3  # in a row: a window without keyframes is no promise
 _SLOWEST = 4
-_FIRST_GAPS = 100  # between samples, that tell a sensor's own rate
-_SLOWER = 1.2  # than told, that is another rate and no jitter
+_FIRST_GAPS = 100  # between samples, from which a sensor's own rate is estimated
+_SLOWER = 1.2  # than configured, that is another rate and no jitter
 
 
 class Pace:
-    """Says which frames to take, and counts what the machine did not manage.
+    """Decides which frames to take, and counts what the machine did not manage.
 
     Attributes:
-        every: one frame in so many is taken; 1: all.
+        every: one frame in this many is taken; 1: all.
     """
 
     def __init__(self, imu_rate_hz: float) -> None:
@@ -54,7 +54,7 @@ class Pace:
         self._sample_ns = sample.t_ns
 
     def _learn_period(self, gap_ns: int) -> None:
-        """Go by a sensor that is slower than it was said to be: what it never sends is not missed."""
+        """Follow a sensor that is slower than configured: what it never sends is not missed."""
         if len(self._gaps_ns) < _FIRST_GAPS:
             self._gaps_ns.append(gap_ns)
             if len(self._gaps_ns) == _FIRST_GAPS and (period_ns := median(self._gaps_ns)) > _SLOWER * self._period_ns:
@@ -120,7 +120,7 @@ class Pace:
 
 
 class MapPace:
-    """Says which keyframes the map takes, by how old frames are when it comes to them.
+    """Decides which keyframes the map takes, by how old frames are when it comes to them.
 
     Attributes:
         left_out: keyframes that it did not take.
@@ -134,7 +134,7 @@ class MapPace:
         self._left_out_last = False
 
     def wants(self, age_s: float) -> bool:
-        """Return whether the map takes a keyframe, when the newest frame that it was told of has waited so long."""
+        """Return whether the map takes a keyframe, when the newest frame it knows of has waited for `age_s`."""
         self.latest_s = max(self.latest_s, age_s)
         every_second = age_s > 0.5 * self._most_s and not self._left_out_last
         self._left_out_last = age_s > self._most_s or every_second

@@ -40,7 +40,7 @@ class PortReadings:
         return passed | {name: port.counters() for name, port in self._ports.items()}
 
     def datums(self) -> dict[str, Geodetic]:
-        """Return the first good fix of each receiver that had one, or the datum that was told."""
+        """Return the first good fix of each receiver that had one, or the datum that was given."""
         passed = {} if self._passed is None else self._passed.datums()
         return passed | {name: datum for name, port in self._ports.items() if (datum := port.datum) is not None}
 

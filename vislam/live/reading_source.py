@@ -27,7 +27,7 @@ class ReadingSource(Protocol):
         ...
 
     def status(self) -> dict[str, str]:
-        """Return in a word how each sensor is: "well", or what ails it."""
+        """Return in a word how each sensor is: "well", or its problem."""
         ...
 
     def counters(self) -> dict[str, dict[str, int]]:
@@ -35,7 +35,7 @@ class ReadingSource(Protocol):
         ...
 
     def datums(self) -> dict[str, Geodetic]:
-        """Return by sensor where on the earth its frame begins, as far as a receiver has told it by now."""
+        """Return by sensor where on the earth its frame begins, as far as a receiver has reported it by now."""
         ...
 
     def close(self) -> None:
@@ -46,7 +46,7 @@ class ReadingSource(Protocol):
 def live_readings(
     config: FurtherSensorsConfig, opener: Callable[[SensorSetup], Callable[[], ReadingSource]]
 ) -> tuple[Suite, Callable[[], ReadingSource]]:
-    """Return the further sensors that a live run is told, and what opens them; an empty suite without any.
+    """Return the further sensors configured for a live run, and what opens them; an empty suite without any.
 
     `opener` is that of the run's source. Raises UsageError for a file that cannot be used, or a sensor that `opener`
     refuses.
@@ -58,7 +58,7 @@ def live_readings(
 
 
 def refuse_unread(setup: SensorSetup, readable: Mapping[str, object], asked: str) -> None:
-    """Raise UsageError for the first sensor that is not among the readable ones; `asked` says what it needs.
+    """Raise UsageError for the first sensor that is not among the readable ones; `asked` names what it needs.
 
     What the board's own magnetometer feeds comes with the IMU.
     """

@@ -52,7 +52,7 @@ class ReplaySource:
     ) -> None:
         """Read the inertial data of a recording; images are read as they are played.
 
-        `calibration` names files that take the place of what the recording says itself, as in `vislam run`. Raises
+        `calibration` names files that take the place of the recording's own, as in `vislam run`. Raises
         UsageError for an unknown source, or for such files where it takes none; DataError when it cannot be used or has
         no inertial data.
         """
@@ -110,7 +110,7 @@ class ReplaySource:
 
 
 class ReplayedFrames:
-    """Plays the frames of a recording at their times; those that nobody took in time are dropped and counted."""
+    """Plays the frames of a recording at their times; those that were not taken in time are dropped and counted."""
 
     def __init__(
         self,

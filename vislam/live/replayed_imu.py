@@ -42,7 +42,7 @@ class ReplayedImu:
 
     @property
     def temperature_c(self) -> None:
-        """No recording tells it."""
+        """Return None: no recording has it."""
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
         """Leave the samples as they were recorded."""

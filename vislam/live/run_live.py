@@ -47,7 +47,7 @@ _AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
 
 
 class LiveSource(Recording, Protocol):
-    """Sensors: what a recording says of itself, and how to open them, each in the process that reads it."""
+    """Sensors: what a recording states of itself, and how to open them, each in the process that reads it."""
 
     duration_s: float | None  # after which there is no more; None: endless
     has_camera: bool  # without one, attitude alone is published
@@ -87,8 +87,8 @@ class _Child:
     report: Connection
     is_ready: bool = False
 
-    def told(self) -> Iterator[Ready | Note | Failure]:
-        """Yield what the process told since; what it logged is logged here."""
+    def messages(self) -> Iterator[Ready | Note | Failure]:
+        """Yield the process's messages since; what it logged is logged here."""
         try:
             while not self.report.closed and self.report.poll():
                 message = self.report.recv()
@@ -107,7 +107,7 @@ class LiveRun:
     """Owns the processes of one run.
 
     Attributes:
-        notes: the newest of what each process told, by role.
+        notes: the newest values of each process, by role.
         metrics: those of the run, when it has ended well.
     """
 
@@ -124,7 +124,7 @@ class LiveRun:
             asked: the source as it was asked for.
             command: as it was typed.
             base: the map of another run, to begin in.
-            beginning: what `base` holds, or the run itself in `out` that is to be resumed; None: it begins anew.
+            beginning: what `base` holds, or the run itself in `out` that is to be resumed; None: a new run.
             web: wires of a page that shows the run, if there is one.
 
         Raises:
@@ -255,18 +255,18 @@ class LiveRun:
         if self.metrics is None and self.is_brief:
             raise KeyboardInterrupt  # the session has all but what came since its last keyframe
         if self.metrics is None:
-            raise HardwareError("the run ended before its folder was written; see what is said above")
-        told = {name: value for name, value in self.notes.get("fast", {}).items() if name != "status"}
+            raise HardwareError("the run ended before its folder was written; see the messages above")
+        live = {name: value for name, value in self.notes.get("fast", {}).items() if name != "status"}
         for doubt in self._doubts:
             _LOG.warning("%s", doubt)
         warnings = [*self.metrics["warnings"], *self._doubts]
         cost = whole_cost(self.metrics, self.notes)
-        self.metrics = {**self.metrics, "warnings": warnings, "live": told, "cost": cost}
+        self.metrics = {**self.metrics, "warnings": warnings, "live": live, "cost": cost}
         write_json(self._out / "metrics.json", self.metrics)
         return self.metrics
 
     def _watch_until_end(self, asked: interrupts.Asked, show: Show | None, duration_s: float | None) -> None:
-        """Watch over the processes until the run is to end, and tell them so."""
+        """Watch over the processes until the run is to end, and signal that to them."""
         deadline = float("inf")
         while not self._signals.stop.is_set():
             self._watch(show)
@@ -286,7 +286,7 @@ class LiveRun:
             if asked.count > self.is_brief:
                 raise KeyboardInterrupt
             if self.is_brief and all("cost" in self.notes.get(role, {}) for role in _WRITERS):
-                break  # they have told all, and to take a process apart takes time
+                break  # they have sent all, and to take a process apart takes time
             if self._failure is not None:
                 patience = min(patience, time.monotonic() + _AFTER_FAILURE_S)
             if time.monotonic() > patience:
@@ -298,20 +298,20 @@ class LiveRun:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)
         try:
             for role, body in self._roles.items():
-                hears, says = self._context.Pipe(duplex=False)
+                receiver, sender = self._context.Pipe(duplex=False)
                 process = self._context.Process(
-                    target=guarded, args=(role, says, self._signals, body, log.level()), name=f"vislam {role}"
+                    target=guarded, args=(role, sender, self._signals, body, log.level()), name=f"vislam {role}"
                 )
                 process.start()
-                says.close()
-                self._children[role] = _Child(process, hears)
+                sender.close()
+                self._children[role] = _Child(process, receiver)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         for end in self._ends:
             end.close()
 
     def _watch(self, show: Show | None) -> None:
-        """Hear what the processes tell, for a moment; notice one that died."""
+        """Receive messages of the processes, for a moment; notice one that died."""
         reports = [child.report for child in self._children.values() if not child.report.closed]
         sentinels = [child.process.sentinel for child in self._children.values() if child.process.is_alive()]
         connection.wait([*reports, *sentinels], timeout=_WATCH_S)
@@ -329,7 +329,7 @@ class LiveRun:
             show(self)
 
     def _hear(self, role: str, child: _Child) -> None:
-        for message in child.told():
+        for message in child.messages():
             if isinstance(message, Ready):
                 child.is_ready = True
                 _LOG.info("the %s process is ready", role)
@@ -348,8 +348,8 @@ class LiveRun:
     @property
     def _doubts(self) -> list[str]:
         """What the user should know of power-up."""
-        told = self.notes.get("fast", {}).get("power_up", {})
-        doubts = [f"no zero at power-up: {told['refused']}"] if "refused" in told else []
+        report = self.notes.get("fast", {}).get("power_up", {})
+        doubts = [f"no zero at power-up: {report['refused']}"] if "refused" in report else []
         return doubts + ([] if self._bias.refusal is None else [self._bias.refusal])
 
     def _end(self) -> None:

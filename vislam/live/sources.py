@@ -91,7 +91,7 @@ def stored_sensors(out: Path) -> SensorsConfig:
         if not isinstance(data, dict):
             raise ValueError("it holds something else than settings")
     except (OSError, ValueError) as error:
-        raise DataError(f"{path} does not tell the sensors of a live run: {error}; begin with --map {out}") from error
+        raise DataError(f"{path} does not state the sensors of a live run: {error}; begin with --map {out}") from error
     return validated(SensorsConfig, data, str(path))
 
 
@@ -131,8 +131,8 @@ class CartSensors:
         self._is_inside = reads_own_imu(inertial, camera)
         self.name = f"live {inertial}+{camera}"
         self.has_camera = camera != "none"
-        told, ideal = calibration_of(inertial, sensors), SensorCalibration()
-        self.is_mag_calibrated = (told.mag_bias_ut, told.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
+        given, ideal = calibration_of(inertial, sensors), SensorCalibration()
+        self.is_mag_calibrated = (given.mag_bias_ut, given.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
         calibration = config.calibration.camera
         self.rig = _rig(camera, sensors, calibration, self._is_inside) if self.has_camera else NO_CAMERA
         self.imu_noise: ImuNoise | None = noise_of(config.calibration, sensors, rate_of(inertial, sensors))
@@ -211,7 +211,7 @@ class CartSensors:
         raise DataError(f"{self.name} is not recorded; `vislam record` does that")
 
     def truth(self) -> Trajectory | None:
-        """Return nothing: nobody knows it."""
+        """Return nothing: it is unknown."""
         return None
 
 

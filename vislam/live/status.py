@@ -1,4 +1,4 @@
-"""One line that tells how a live run is going."""
+"""The state of a live run in one line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from vislam.live.run_live import LiveRun
 
 
 def status_line(run: LiveRun) -> str:
-    """Return where the cart is, how sure that is, what ails the sensors, and how late poses are."""
+    """Return where the cart is, how sure that is, what is wrong with the sensors, and how late poses are."""
     if not run.is_going:
         waiting = ", ".join(run.waits_for) or "nothing"
         return f"getting ready: waiting for {waiting}"
@@ -15,14 +15,14 @@ def status_line(run: LiveRun) -> str:
         return "ending at once: the map's files and the report are left for later"
     if run.is_ending:
         return "ending: the run is written down; Ctrl-C again does not wait for that"
-    told = run.notes.get("fast", {})
-    status, latency = told.get("status"), told.get("latency_ms", {})
+    fast = run.notes.get("fast", {})
+    status, latency = fast.get("status"), fast.get("latency_ms", {})
     if not status:
         return "no pose yet"
     x, y, z = status["position_m"]
     health = Health(status["health"])
     names = " ".join((flag.name or "").lower() for flag in health) or "not levelled"
-    refused = told.get("power_up", {}).get("refused")
+    refused = fast.get("power_up", {}).get("refused")
     names += "  found in the map" if run.notes.get("map", {}).get("found_in_map") else ""
     reasons = run.notes.get("front", {}).get("verdict", {}).get("reasons")
     names += f"  because {reasons[0]}" if reasons else ""

@@ -90,7 +90,7 @@ class TruthFit:
         return Trajectory(truth.t_ns + shift_ns, truth.T_world_body @ self.T_truth_imu)
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """What is beyond chance, in words; empty when nothing is."""
         found = []
         if self.is_turned:

@@ -109,6 +109,6 @@ def begun_by_page(
                 else:
                     steps.obey(asked.do, asked.values)
             can = ["start"] if not steps.is_going else []
-            station.tell("waiting", source=options.source, can=can, steps=STEPS, wizard=steps.shown)
+            station.update("waiting", source=options.source, can=can, steps=STEPS, wizard=steps.shown)
             steps.turn()
     raise VislamError("the process of the web page died before the run began; start it again")

@@ -113,7 +113,7 @@ class CalibrationSteps:
         if self._opened is not None:
             self._opened.close()
         self.shown = {"kind": self._kind, "stage": "computing", "advice": "computing; this may take a minute"}
-        self._station.tell("waiting", wizard=self.shown)
+        self._station.update("waiting", wizard=self.shown)
         self._watch = self._opened = None
         outcome = watch.calibrate()
         files = [f"{FOLDER}/{path.name}" for path in outcome.files]

@@ -1,4 +1,4 @@
-"""Bags: rosbag 1, rosbag 2 and MCAP as recordings, with topics guessed or told."""
+"""Bags: rosbag 1, rosbag 2 and MCAP as recordings, with topics guessed or given."""
 
 from __future__ import annotations
 
@@ -27,5 +27,5 @@ def survey(path: Path) -> Survey:
 
 
 def survey_with(path: Path, options: Mapping[str, str]) -> Survey:
-    """Return what a bag holds, with topics as they are told; raises UsageError for an option that is none."""
+    """Return what a bag holds, with topics as they are given; raises UsageError for an option that is none."""
     return survey_bag(path, validated(BagOptions, options, f"bag:{path}"))

@@ -97,7 +97,7 @@ def bag_files(path: Path) -> list[Path]:
         raise DataError(f"{path} holds no .mcap or .db3 file")
     if len(there) > _MOST_FILES:
         raise DataError(f"{path} holds {len(there)} files, more than {_MOST_FILES}")
-    order = _told_order(path / "metadata.yaml")
+    order = _order(path / "metadata.yaml")
     return sorted(there, key=lambda file: order.get(file.name, len(order)))
 
 
@@ -130,11 +130,11 @@ def _container(path: Path, number: int) -> Container:
     )
 
 
-def _told_order(metadata: Path) -> dict[str, int]:
-    """Return the numbers of the files that a recorder's metadata names; what cannot be read says nothing."""
+def _order(metadata: Path) -> dict[str, int]:
+    """Return the numbers of the files that a recorder's metadata names; what cannot be read gives none."""
     try:
-        told = load_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
-        return {Path(str(name)).name: number for number, name in enumerate(told)}
+        names = load_yaml(metadata)["rosbag2_bagfile_information"]["relative_file_paths"]
+        return {Path(str(name)).name: number for number, name in enumerate(names)}
     except (DataError, OSError, KeyError, TypeError, ValueError):
         return {}
 

@@ -1,4 +1,4 @@
-"""Which topic of a bag is which sensor: as told, or guessed from types, names, sizes and rates."""
+"""Which topic of a bag is which sensor: as given, or guessed from types, names, sizes and rates."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _NAMED = 30  # topics that an error names
 
 @dataclass(frozen=True, slots=True)
 class BagOptions:
-    """What may be told of a bag behind its path, as `bag:drive.mcap,cam0=/left/image_raw,imu=none`."""
+    """Options of a bag behind its path, as `bag:drive.mcap,cam0=/left/image_raw,imu=none`."""
 
     cam0: str | None = None  # topics; none: leave it out
     cam1: str | None = None
@@ -51,7 +51,7 @@ class BagOptions:
 
 @dataclass(frozen=True, slots=True)
 class ImageFacts:
-    """What the first image of a topic says."""
+    """What the first image of a topic shows."""
 
     entry: Entry
     compressed: bool
@@ -76,7 +76,7 @@ class Choice:
     mag: Entry | None
     truth: Entry | None
 
-    def told(self) -> dict[str, str]:
+    def roles(self) -> dict[str, str]:
         """Return what each topic was taken for."""
         taken = {camera.name: f"cam{k}" for k, camera in enumerate(self.cameras)}
         taken |= {info.topic.name: f"calibration of cam{k}" for k, info in enumerate(self.infos) if info is not None}
@@ -89,7 +89,7 @@ class Choice:
 
 
 def chosen(listing: Listing, options: BagOptions) -> Choice:
-    """Return which topic is which sensor; raises DataError for one that was told and is not there."""
+    """Return which topic is which sensor; raises DataError for one that was given and is not there."""
     images = [_facts(listing, entry) for entry in listing.of_type(IMAGE, COMPRESSED)]
     usual = [facts for facts in images if facts.size_px is not None]
     colors = [facts for facts in usual if not _looks_like_depth(facts)]
@@ -104,8 +104,8 @@ def chosen(listing: Listing, options: BagOptions) -> Choice:
     if depth is None and options.depth is None and cam0 is not None and len(cameras) == 1:
         depth = next((facts for facts in depths if _registered(facts, cam0)), None)
     infos = tuple(
-        _entry(listing, f"info{k}", told, (CAMERA_INFO,), _info(listing, camera, len(cameras)))
-        for k, (camera, told) in enumerate(zip(cameras, (options.info0, options.info1), strict=False))
+        _entry(listing, f"info{k}", given, (CAMERA_INFO,), _info(listing, camera, len(cameras)))
+        for k, (camera, given) in enumerate(zip(cameras, (options.info0, options.info1), strict=False))
     )
     imus, mags = listing.of_type(IMU), listing.of_type(MAGNETIC)
     return Choice(
@@ -122,12 +122,12 @@ def topics_there(listing: Listing, types: Iterable[str] = ()) -> str:
     """Return the names of the topics of some types, or of all, for errors."""
     wanted = set(types)
     names = sorted(name for name, entry in listing.entries.items() if not wanted or entry.topic.type in wanted)
-    told = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-    return f"there are {told}" if names else "there is none"
+    listed = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    return f"there are {listed}" if names else "there is none"
 
 
 def wanted_topic(listing: Listing, role: str, name: str, types: tuple[str, ...]) -> Entry:
-    """Return a topic that was told; raises DataError naming those that would fit."""
+    """Return a topic that was given; raises DataError naming those that would fit."""
     entry = listing.entries.get(name) or listing.entries.get(f"/{name}")
     kinds = " or ".join(type_.rsplit("/", 1)[-1] for type_ in types)
     if entry is None:
@@ -145,17 +145,17 @@ def option_names() -> str:
 
 
 def _entry(
-    listing: Listing, role: str, told: str | None, types: tuple[str, ...], guessed: Entry | None
+    listing: Listing, role: str, given: str | None, types: tuple[str, ...], guessed: Entry | None
 ) -> Entry | None:
-    if told is None or told == NONE:
-        return None if told == NONE else guessed
-    return wanted_topic(listing, role, told, types)
+    if given is None or given == NONE:
+        return None if given == NONE else guessed
+    return wanted_topic(listing, role, given, types)
 
 
 def _image(
-    listing: Listing, images: list[ImageFacts], role: str, told: str | None, guessed: ImageFacts | None
+    listing: Listing, images: list[ImageFacts], role: str, given: str | None, guessed: ImageFacts | None
 ) -> ImageFacts | None:
-    entry = _entry(listing, role, told, (IMAGE, COMPRESSED), None if guessed is None else guessed.entry)
+    entry = _entry(listing, role, given, (IMAGE, COMPRESSED), None if guessed is None else guessed.entry)
     if entry is None:
         return None
     facts = next(facts for facts in images if facts.entry is entry)
@@ -182,7 +182,7 @@ def _guessed_cameras(colors: list[ImageFacts], depths: list[ImageFacts], listing
     """Return the camera or the pair that a run most likely wants: with registered depth, else a pair, else the best."""
     ranked = sorted(colors, key=lambda facts: _rank(facts, listing))
     for facts in ranked:
-        if any(_registered(depth, facts) and _told_registered(depth) for depth in depths):
+        if any(_registered(depth, facts) and _is_registered(depth) for depth in depths):
             return (facts,)
     for facts in ranked:
         if (other := _other_of(facts, colors)) is not None:
@@ -208,10 +208,10 @@ def _other_of(first: ImageFacts | None, colors: list[ImageFacts]) -> ImageFacts 
 
 
 def _registered(depth: ImageFacts, color: ImageFacts) -> bool:
-    return depth.size_px == color.size_px and (depth.frame == color.frame or _told_registered(depth))
+    return depth.size_px == color.size_px and (depth.frame == color.frame or _is_registered(depth))
 
 
-def _told_registered(depth: ImageFacts) -> bool:
+def _is_registered(depth: ImageFacts) -> bool:
     return any(word in depth.name for word in _REGISTERED)
 
 

@@ -108,7 +108,7 @@ def unpacked(data: bytes, method: str, declared: int) -> tuple[bytes, bool]:
     except _errors(method):
         return _in_pieces(data, method, declared), False
     if len(out) > declared:
-        raise DamagedError("chunk that unpacks to more than it says")
+        raise DamagedError("chunk that unpacks to more than it states")
     return out, len(out) == declared
 
 

@@ -79,8 +79,8 @@ def decoded(topic: Topic, data: bytes) -> Any:
 def stamp_ns(topic: Topic, head: bytes) -> int | None:
     """Return the stamp in a message's header by its first bytes; None when there is none or it is impossible."""
     if topic.schema:
-        told = foxglove.stamp(topic.schema, topic.encoding, head)
-        return None if told is None else _whole_ns(*told)
+        stamp = foxglove.stamp(topic.schema, topic.encoding, head)
+        return None if stamp is None else _whole_ns(*stamp)
     try:
         if topic.encoding == "ros1":
             _sequence, seconds, rest_ns = _ROS1_STAMP.unpack_from(head)

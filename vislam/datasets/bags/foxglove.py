@@ -91,11 +91,11 @@ def why_refused(schema: str, encoding: str, definition: bytes) -> str:
     if len(definition) > _MOST_DEFINITION_BYTES:
         return f"its definition of {schema} has {len(definition)} bytes, more than any of Foxglove's"
     try:
-        told = _definitions(definition)
+        defined = _definitions(definition)
     except DamagedError as error:
         return f"its definition of {schema} cannot be read: {error}"
     for name in _needed(schema):
-        if (wrong := _difference(name, told.get(name))) is not None:
+        if (wrong := _difference(name, defined.get(name))) is not None:
             return f"its definition of {schema} is not Foxglove's: {wrong}"
     return ""
 
@@ -116,7 +116,7 @@ def stamp(schema: str, encoding: str, head: bytes) -> tuple[int, int] | None:
         return None
     try:
         if encoding == JSON:
-            time = _of_json(_TIME, _told_time(_loaded(head).get("timestamp")))
+            time = _of_json(_TIME, _time(_loaded(head).get("timestamp")))
             return int(time["seconds"]), int(time["nanos"])
         for number, lies, value in _fields(head):
             if number == field.number and lies == _LENGTH:
@@ -133,12 +133,12 @@ def _needed(schema: str) -> list[str]:
     return [schema, *(name for kind in inner for name in _needed(kind))]
 
 
-def _difference(name: str, told: dict[str, _Field] | None) -> str | None:
-    if told is None:
+def _difference(name: str, defined: dict[str, _Field] | None) -> str | None:
+    if defined is None:
         return f"no {name} in it"
-    by_number = {field.number: known for known, field in told.items()}
+    by_number = {field.number: known for known, field in defined.items()}
     for known, field in _MESSAGES[name].items():
-        if known in told and told[known] != field:
+        if known in defined and defined[known] != field:
             return f"{name}.{known} has another number or type"
         if by_number.get(field.number, known) != known:
             return f"number {field.number} of {name} is {by_number[field.number][:40]}"
@@ -282,15 +282,15 @@ def _loaded(data: bytes) -> dict[str, Any]:
     return loaded
 
 
-def _of_json(name: str, told: Any) -> dict[str, Any]:
+def _of_json(name: str, message: Any) -> dict[str, Any]:
     """Return the fields of a message that we know, as `_of_protobuf` does."""
-    if not isinstance(told, dict):
+    if not isinstance(message, dict):
         raise DamagedError(f"message without {name}")
     values = _empty(name)
     for key, field in _MESSAGES[name].items():
-        if told.get(key) is None:
+        if message.get(key) is None:
             continue
-        given = told[key]
+        given = message[key]
         if not field.many:
             values[key] = _json_value(key, field.kind, given)
         elif isinstance(given, list) and len(given) <= _MOST_NUMBERS:
@@ -303,7 +303,7 @@ def _of_json(name: str, told: Any) -> dict[str, Any]:
 def _json_value(key: str, kind: int | str, given: Any) -> Any:
     try:
         if isinstance(kind, str):
-            return _of_json(kind, _told_time(given) if kind == _TIME else given)
+            return _of_json(kind, _time(given) if kind == _TIME else given)
         if kind == _TEXT and isinstance(given, str):
             return given[:_MOST_TEXT_BYTES]
         if kind == _BYTES and isinstance(given, str):
@@ -317,7 +317,7 @@ def _json_value(key: str, kind: int | str, given: Any) -> Any:
     raise DamagedError(f"message whose {key} is of another type")
 
 
-def _told_time(given: Any) -> dict[str, Any]:
+def _time(given: Any) -> dict[str, Any]:
     """Return a stamp as Foxglove's JSON has it, under protobuf's names."""
     if not isinstance(given, dict):
         raise DamagedError("message whose timestamp is no pair of sec and nsec")

@@ -1,6 +1,6 @@
 """MCAP files, read front to back: as with rosbag 1 the index is not asked, so a file without one is read alike.
 
-Only behind damage the index says where to go on, if it is there and what it says is true.
+Only behind damage the index shows where to go on, if it is there and right.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MOST_HEAD_BYTES = _CHUNK_HEAD.size + 32 + 8
 
 
 class _Schema(NamedTuple):
-    """What a schema says of the messages on its channels."""
+    """What a schema states of the messages on its channels."""
 
     name: str
     refused: str = ""
@@ -144,7 +144,7 @@ class Mcap:
         return self._bytes.size
 
     def _indexed_chunks(self) -> Iterator[int]:
-        """Yield where chunks begin as the index at the file's end says, as far as it can be read."""
+        """Yield where chunks begin by the index at the file's end, as far as it can be read."""
         footer = self._bytes.fetch(self._bytes.size - _FOOTER_BYTES, _FOOTER_BYTES)
         if len(footer) < _FOOTER_BYTES or footer[0] != _FOOTER:
             return

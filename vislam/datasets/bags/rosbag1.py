@@ -1,6 +1,6 @@
 """Files of rosbag 1 (format 2.0), read front to back.
 
-The index at the end of such a file says nothing that its chunks do not say, so it is not asked: a bag without one, cut
+The index at the end of such a file repeats what its chunks state, so it is not read: a bag without one, cut
 off or never closed, is read in the same way as a whole one, and no number in an index can mislead.
 """
 
@@ -157,10 +157,10 @@ def _one(
     elif op == _CONNECTION:
         if length > _MOST_DEFINITION_BYTES or len(topics) >= MOST_TOPICS:
             raise DamagedError("connection that is larger than any, or one too many")
-        told = _fields(reader.read(at, length))
+        about = _fields(reader.read(at, length))
         name = fields.get(b"topic", b"").decode("utf-8", "replace")
-        type_ = message_type(told.get(b"type", b"").decode("utf-8", "replace"))
-        digest = told.get(b"md5sum", b"").decode("ascii", "replace")
+        type_ = message_type(about.get(b"type", b"").decode("utf-8", "replace"))
+        digest = about.get(b"md5sum", b"").decode("ascii", "replace")
         topics.setdefault(_number(fields, b"conn"), Topic(name, type_, "ros1", digest))
 
 

@@ -123,7 +123,7 @@ class Database:
 
 
 def _is_cut_off(path: Path) -> bool:
-    """Return whether a database is shorter than its first page says."""
+    """Return whether a database is shorter than its first page states."""
     with open_file(path) as file:
         head = file.read(32)
         size = os.fstat(file.fileno()).st_size

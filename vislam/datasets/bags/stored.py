@@ -63,7 +63,7 @@ class Container(Protocol):
 
 
 class DamagedError(Exception):
-    """Bytes that are not what their container says; met and counted in this package, never seen by its users."""
+    """Bytes that are not what their container states; met and counted in this package, never seen by its users."""
 
 
 def message_type(name: str) -> str:

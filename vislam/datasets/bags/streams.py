@@ -23,7 +23,7 @@ from vislam.datasets.images import UnreadableImageError
 from vislam.datasets.loaders import FrameTable, LoadedImages
 from vislam.datasets.tables import Problems, Row
 
-_ENOUGH = 20  # so many messages, and most of them unusable, settle it
+_ENOUGH = 20  # messages, and most of them unusable, settle it
 _UT_PER_TESLA = 1e6
 Values = Callable[[Any], list[float]]
 
@@ -76,7 +76,7 @@ class BagStreams:
         return iter(()) if self._mag is None else topic_rows(self._bag, self._mag, _field, self._by_log_time, problems)
 
     def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> BagLoader:
-        """Return what loads the images of frames, of the first `cameras` only if told."""
+        """Return what loads the images of frames, of the first `cameras` only if given."""
         return BagLoader(self._bag, frames, self._cameras[:cameras], self._depth, rig)
 
 

@@ -55,7 +55,7 @@ class _Found:
 
 
 def survey_bag(path: Path, options: BagOptions) -> Survey:
-    """Return what a bag holds, with the topics that are told or else guessed; what is wrong is in `errors`.
+    """Return what a bag holds, with the topics that are given or else guessed; what is wrong is in `errors`.
 
     Raises DataError when `rosbags` is not installed.
     """
@@ -105,7 +105,7 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         imu_noise=noise,
         R_body_mag=np.eye(3) if T_body_mag is None else T_body_mag[:3, :3],
         truth=None if choice.truth is None else _truth(bag, choice.truth, frames, body),
-        topics=_topics(listing, choice.told() | _places(listing)),
+        topics=_topics(listing, choice.roles() | _places(listing)),
         known_cameras=known,
         lacking=found.lacking,
         problems=found.problems,
@@ -123,20 +123,20 @@ def _noise(path: Path, imu: Entry, found: _Found) -> ImuNoise | None:
             found.lacking["imu_noise"] = error
             return None
     found.lacking["imu_noise"] = DataError(
-        f"{path}: no bag tells how noisy its IMU ({imu.topic.name}) is; give {_NOISE}, or write {beside}; "
+        f"{path}: a bag does not state the noise of its IMU ({imu.topic.name}); give {_NOISE}, or write {beside}; "
         "see docs/formats.md"
     )
     return None
 
 
-def _topics(listing: Listing, told: dict[str, str]) -> tuple[TopicSummary, ...]:
+def _topics(listing: Listing, roles: dict[str, str]) -> tuple[TopicSummary, ...]:
     return tuple(
         TopicSummary(
             name,
             entry.topic.schema or entry.topic.type,
             entry.count,
             entry.rate_hz,
-            told.get(name, why_unreadable(entry.topic) or "not used"),
+            roles.get(name, why_unreadable(entry.topic) or "not used"),
         )
         for name, entry in sorted(listing.entries.items())
     )
@@ -156,7 +156,7 @@ def _images(facts: ImageFacts, name: str, problems: Problems) -> tuple[ImageList
 
 
 def _frames(listing: Listing) -> Frames:
-    """Return the frames of the bag: those that are static first, then those that others keep telling the same."""
+    """Return the frames of the bag: those that are static first, then those that never change."""
     frames = Frames()
     topics = listing.of_type(TRANSFORMS, OLD_TRANSFORMS)
     for entry in sorted(topics, key=lambda entry: "static" not in entry.topic.name):
@@ -174,7 +174,7 @@ def _frame_id(listing: Listing, entry: Entry | None) -> str:
 def _known_cameras(
     listing: Listing, choice: Choice, frames: Frames, body: str, found: _Found
 ) -> tuple[KnownCamera, ...]:
-    """Return what the bag says of each camera: its lens, and where it sits in the body."""
+    """Return what the bag states of each camera: its lens, and where it sits in the body."""
     infos = [None if info is None else next(listing.first_messages(info), None) for info in choice.infos]
     known: list[KnownCamera] = []
     for k, (facts, info) in enumerate(zip(choice.cameras, infos, strict=True)):
@@ -209,8 +209,8 @@ def _lens(facts: ImageFacts, info: Any) -> Camera:
     assert facts.size_px is not None
     size = (int(info.width), int(info.height))
     if size != facts.size_px:
-        told = f"CameraInfo is for {size[0]}x{size[1]}, its images are {facts.size_px[0]}x{facts.size_px[1]}"
-        raise DataError(f"{where}: its {told}; give {_CALIBRATION}")
+        sizes = f"CameraInfo is for {size[0]}x{size[1]}, its images are {facts.size_px[0]}x{facts.size_px[1]}"
+        raise DataError(f"{where}: its {sizes}; give {_CALIBRATION}")
     try:
         return ros_camera(size, K, name, coefficients, where)
     except DataError as error:

@@ -1,4 +1,4 @@
-"""Topics of a bag as readings of further sensors: what each type of message tells each kind of sensor."""
+"""Topics of a bag as readings of further sensors: what each type of message gives each kind of sensor."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def readings_of_topic(name: str, sensor: Configured, file: SensorFile, problems:
 
 
 def first_fix(made: FixReadings, file: SensorFile) -> None:
-    """Have the first fix of a bag that is good enough told to `made`, so that it knows its frame. Raises DataError."""
+    """Give `made` the first fix of a bag that is good enough, so that it knows its frame. Raises DataError."""
     need_rosbags()
     with closing(Bag(file.path)) as bag:
         entry = wanted_topic(Listing(bag, False, Problems()), "topic", file.topic, tuple(_BY_COLUMNS[_PLACE]))
@@ -73,7 +73,7 @@ def first_fix(made: FixReadings, file: SensorFile) -> None:
 
 
 def _takes(sensor: Configured) -> dict[str, Numbers]:
-    """Return the types of messages that tell a sensor something, and how."""
+    """Return the types of messages that a sensor takes, and how."""
     takes = _BY_COLUMNS.get(sensor.columns)
     if takes is None:
         raise DataError(f"no message of a bag gives {', '.join(sensor.columns)}; give a table with these")
@@ -118,11 +118,11 @@ def _fixes(bag: Bag, entry: Entry, made: FixReadings, problems: Problems) -> Ite
 
 
 def _wheels(bag: Bag, entry: Entry, name: str, file: SensorFile, problems: Problems) -> Iterator[Reading]:
-    """Yield speeds of two wheels by their rates, or where these are not told by what they turned between messages."""
+    """Yield speeds of two wheels by their rates, or where these are not given by what they turned between messages."""
     joints = file.joints
     if joints is None:
-        told = 'joints = {left = "left_wheel_joint", right = "right_wheel_joint", radius_m = 0.08}'
-        raise DataError(f"[sensors.{name}]: joint states need to know which joints are wheels: {told}")
+        example = 'joints = {left = "left_wheel_joint", right = "right_wheel_joint", radius_m = 0.08}'
+        raise DataError(f"[sensors.{name}]: joint states need to know which joints are wheels: {example}")
     before: tuple[int, np.ndarray] | None = None
     for found, message in messages_of(bag, entry.topic, problems):
         t_ns = _time_ns(found, entry, problems)
@@ -140,7 +140,7 @@ def _wheels(bag: Bag, entry: Entry, name: str, file: SensorFile, problems: Probl
 
 
 def _of_wheels(message: Any, values: Any, joints: JointsSettings) -> np.ndarray | None:
-    """Return the values of left and right wheel [2], None where they are not told or are no numbers."""
+    """Return the values of left and right wheel [2], None where they are absent or no numbers."""
     names = list(message.name)
     if len(values) != len(names) or joints.left not in names or joints.right not in names:
         return None

@@ -1,4 +1,4 @@
-"""Where sensors sit: the frames of a bag as its static transforms tell them."""
+"""Where sensors sit: the frames of a bag as its static transforms give them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from vislam.core.geometry import invert, rotation_from_quaternion_xyzw
 from vislam.core.messages import Array
 
 _MOST_FRAMES = 10_000
-_SAME = 1e-9  # of a transform that is told again
+_SAME = 1e-9  # of a transform that is repeated
 
 
 class Frames:
-    """A tree of frames, of transforms that are static or were told the same every time."""
+    """A tree of frames, of transforms that are static or were the same every time."""
 
     def __init__(self) -> None:
         """Begin without any."""
@@ -23,9 +23,9 @@ class Frames:
 
     def learn(self, message: Any) -> None:
         """Take the transforms of a TFMessage; those that are no rigid motion are left out."""
-        for told in message.transforms:
-            child, parent = _name(told.child_frame_id), _name(told.header.frame_id)
-            t, q = told.transform.translation, told.transform.rotation
+        for given in message.transforms:
+            child, parent = _name(given.child_frame_id), _name(given.header.frame_id)
+            t, q = given.transform.translation, given.transform.rotation
             T = rigid((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
             if T is None or child == parent or len(self._parents) >= _MOST_FRAMES:
                 continue

@@ -82,7 +82,7 @@ class TrackRecording:
         truth: Trajectory | None = None,
         noise: ImuNoise | None = None,
     ) -> None:
-        """Read a table; without `noise`, what the table says was assumed counts.
+        """Read a table; without `noise`, what the table states as assumed counts.
 
         Raises DataError when the table cannot be used, UsageError when it is shorter than was asked for.
         """
@@ -224,7 +224,7 @@ def _rig(table: TrackTable, path: Path) -> Rig:
 
 
 def _assumed_noise(table: TrackTable, path: Path) -> ImuNoise:
-    """Return the noise that the table says was assumed of the IMU."""
+    """Return the noise that the table states as assumed of the IMU."""
     squared = np.array(_numbers(table, tuple(f"eqf.{name}" for name in _NOISE), path))
     if (squared < 0.0).any() or (squared[:2] == 0.0).any():
         raise DataError(f"{path}: eqf.input_var_* must be positive, got {squared.tolist()}; give truth=RECORDING")

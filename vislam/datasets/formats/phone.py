@@ -47,7 +47,7 @@ LOOKS_FOR = (
 _STANDARD_GRAVITY_M_S2 = 9.80665
 _HEADER_LINES = 5
 _MOST_METADATA_BYTES = 2**16
-_LOOKED_AT = 500  # forces, to tell g from m/s^2
+_LOOKED_AT = 500  # forces, to distinguish g from m/s^2
 _AXES = ("x", "y", "z")
 _RATES = ("gx[rad/s]", "gy[rad/s]", "gz[rad/s]")
 _FORCES = ("ax[m/s^2]", "ay[m/s^2]", "az[m/s^2]")
@@ -194,7 +194,7 @@ def _asked(path: Path, what: str) -> Path:
 
 
 def _samples(path: Path, logger: Logger | None) -> tuple[ImuRows, list[Finding]]:
-    """Return the inertial samples and what doctor tells of them; raises DataError where a table is missing."""
+    """Return the inertial samples and what doctor reports of them; raises DataError where a table is missing."""
     if logger == "Sensor Logger":
         return _of_sensor_logger(path)
     if logger == "MARS logger":
@@ -209,13 +209,13 @@ def _samples(path: Path, logger: Logger | None) -> tuple[ImuRows, list[Finding]]
 
 def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
     platform, standardised = _platform(path)
-    told = f"Sensor Logger on {platform or 'a phone that it does not name'}"
-    # Apple tells forces of inertia: at rest gravity points down. Android, and the app where it standardises, the other
+    app = f"Sensor Logger on {platform or 'a phone that it does not name'}"
+    # Apple gives forces of inertia: at rest gravity points down. Android, and the app where it standardises, the other
     factor = -1.0 if platform == "ios" and not standardised else 1.0
     rates = _of_axes(path / "Gyroscope.csv", 1.0)
     if (path / "TotalAcceleration.csv").is_file():
         forces = _of_axes(path / "TotalAcceleration.csv", factor)
-        what = f"{told}: TotalAcceleration.csv is interpolated at the stamps of Gyroscope.csv"
+        what = f"{app}:  TotalAcceleration.csv is interpolated at the stamps of Gyroscope.csv"
         return _Pair(rates, forces), [Finding("ok", what, path.name)]
     if not (path / "Accelerometer.csv").is_file():
         raise DataError(
@@ -233,7 +233,7 @@ def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
         )
     forces, gravity = (_of_axes(path / name, factor) for name in ("Accelerometer.csv", "Gravity.csv"))
     sign = ", negated as it is Apple's" if factor < 0.0 else ""
-    what = f"{told}: Accelerometer.csv and Gravity.csv are added{sign} and interpolated at the stamps of Gyroscope.csv"
+    what = f"{app}:  Accelerometer.csv and Gravity.csv are added{sign} and interpolated at the stamps of Gyroscope.csv"
     return _Pair(rates, forces, gravity), [Finding("ok", what, path.name)]
 
 
@@ -245,7 +245,7 @@ def _of_axes(path: Path, factor: float) -> _Table:
 
 
 def _platform(path: Path) -> tuple[str, bool]:
-    """Return the platform in Metadata.csv, empty where it is not told, and whether the app standardised its frames."""
+    """Return the platform in Metadata.csv, empty where it is not given, and whether the app standardised its frames."""
     file = path / "Metadata.csv"
     if not file.is_file():
         return "", False
@@ -280,7 +280,7 @@ def _stamp_parser(name: str, path: Path) -> Callable[[str], int]:
         return parse_ns
     if "[sec]" in name:
         return parse_seconds
-    raise DataError(f"{path}: the unit of the stamps is not told in '{name[:40]}'; [nanosec] or [sec] is read")
+    raise DataError(f"{path}: the unit of the stamps is not stated in '{name[:40]}'; [nanosec] or [sec] is read")
 
 
 def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[ImageList, Path | None]:

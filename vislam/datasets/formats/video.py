@@ -4,7 +4,7 @@ For `ride.mp4`: `ride.csv` (one row a frame, stamp in ns), `ride.yaml` (a camera
 IMU, `ride.imu.csv` and `ride.imu.yaml` in the ASL layout. Every stamp must be from the clock that stamps the IMU.
 
 An MP4 without `ride.csv` has its frames stamped by its own table of times. Of a GoPro's, the IMU in its telemetry is
-by that clock, too, and is read where `ride.imu.yaml` says its noise; later chapters are one film with the first.
+by that clock, too, and is read where `ride.imu.yaml` states its noise; later chapters are one film with the first.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def recognises(path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class FilmOptions:
-    """What may be told of a film behind its path, as `video:GX010001.MP4,chapters=one`."""
+    """Options of a film behind its path, as `video:GX010001.MP4,chapters=one`."""
 
     chapters: Literal["all", "one"] = "all"  # one: the file that is named alone
 
@@ -62,7 +62,7 @@ def survey(path: Path) -> Survey:
 
 
 def survey_with(path: Path, options: Mapping[str, str]) -> Survey:
-    """Return what a video holds, as told; raises UsageError for an option that is none."""
+    """Return what a video holds, with its options; raises UsageError for an option that is none."""
     return _survey(path, validated(FilmOptions, options, f"video:{path}").chapters == "all")
 
 
@@ -142,7 +142,7 @@ def _of_film(film: Film, path: Path, problems: Problems) -> ImageList:
 
 
 def _telemetry(path: Path, joined: bool) -> Telemetry | JoinedTelemetry | None:
-    """Return a GoPro's telemetry; what is wrong with the file is told where its frames are looked for."""
+    """Return a GoPro's telemetry; what is wrong with the file is reported where its frames are looked for."""
     try:
         return open_joined(path) if joined else open_telemetry(path)
     except DataError:

@@ -20,7 +20,7 @@ from vislam.vision.depth_edges import EdgeAlignment, align_edges
 from vislam.vision.depth_focal import FocalFit, SeenPoints, fit_focal
 
 _HISTOGRAMS = 24  # depth images whose numbers are counted
-_LEAST_SHARE = 0.005  # of the pixels: a wall never fills so many with one number that nothing is near
+_LEAST_SHARE = 0.005  # of the pixels: a wall never fills as many with one number that has no neighbours
 _NEAR = 0.15  # numbers that differ by less are neighbours: a surface has them as often
 _STANDS_OUT = 30.0  # over any of its neighbours
 _LEAST_OTHERS = 0.1  # of the pixels: with fewer, one flat face is all that there is
@@ -42,7 +42,7 @@ class OddValue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdFacts:
-    """What was measured; None where the recording does not tell."""
+    """What was measured; None where the recording does not show it."""
 
     odd_values: tuple[OddValue, ...]
     valid_share: float  # of the pixels that have a depth
@@ -67,9 +67,9 @@ class RgbdFacts:
 def rgbd_facts(found: Survey, rig: Rig, frames: FrameTable) -> RgbdFacts:
     """Measure a recording with depth; raises DataError when an image is not of the calibrated size."""
     odd, valid_share, median_m = _numbers(found, rig)
-    told = found.depth_format
+    given = found.depth_format
     unknown = tuple(one.value for one in odd if not one.is_known)
-    found = replace(found, depth_format=replace(told, invalid=(*told.invalid, *unknown)))
+    found = replace(found, depth_format=replace(given, invalid=(*given.invalid, *unknown)))
     seen = walk(found, rig, frames)
     edges = align_edges(seen.ends)
     focal = _focal(found, rig, frames, seen, edges)
@@ -107,7 +107,7 @@ def odd_values(counts: NDArray[np.int64], often: Bools, known: Sequence[int]) ->
     Args:
         counts: [65536] pixels with each number.
         often: [65536] whether it occurs in many of the images.
-        known: numbers that are told to mean nothing.
+        known: numbers that mean "not measured" by the recording.
     """
     total, out = int(counts.sum()), list[OddValue]()
     for value in np.flatnonzero(counts).tolist():
@@ -126,7 +126,7 @@ def odd_values(counts: NDArray[np.int64], often: Bools, known: Sequence[int]) ->
 
 
 def _focal(found: Survey, rig: Rig, frames: FrameTable, seen: Walk, edges: EdgeAlignment | None) -> FocalFit | None:
-    """Return what the tracks say where depth is read at the place and time that the edges tell."""
+    """Return what the tracks show where depth is read at the place and time that the edges show."""
     known = (np.zeros(2), np.full(2, _UNKNOWN_OFFSET_PX), 0.0, _UNKNOWN_LAG_S)
     if edges is not None:
         known = (edges.offset_px, edges.offset_sigma_px, edges.lag_s, edges.lag_sigma_s)

@@ -18,7 +18,7 @@ _MOST_OFFSET = 0.006  # of the image's width: 4 px of 640
 _MOST_LAG_S = 0.020  # as far as depth and colour are paired
 _MOST_FOCAL = 0.012
 _SURE = 2.5  # sigmas beyond nothing
-_MOST_OFFSET_SIGMA_PX, _MOST_LAG_SIGMA_S, _MOST_FOCAL_SIGMA = 2.0, 0.010, 0.010  # beyond these it cannot tell
+_MOST_OFFSET_SIGMA_PX, _MOST_LAG_SIGMA_S, _MOST_FOCAL_SIGMA = 2.0, 0.010, 0.010  # beyond these no judgement is possible
 _DEPTHS_M = (0.15, 40.0)  # of the median, of any sensor in any room
 _LEAST_CONTRAST = 1.04  # of the edges' peak
 _MEND = "`vislam calibrate rgbd` writes a sensor.yaml that mends it"
@@ -31,9 +31,9 @@ class RgbdFault:
     """One thing that is wrong between colour and depth, how much and how surely."""
 
     what: What
-    size: float  # raw value, metres, pixels, seconds, or true over told minus one
+    size: float  # raw value, metres, pixels, seconds, or true over given minus one
     sigma: float
-    told: str
+    text: str
     next_step: str = _MEND
 
 
@@ -65,12 +65,12 @@ def rgbd_faults(facts: RgbdFacts, width_px: int) -> tuple[RgbdFault, ...]:
 def _number_faults(facts: RgbdFacts) -> list[RgbdFault]:
     out = []
     for odd in facts.odd_values:
-        told = f"depth {odd.value} in {odd.share:.1%} of the pixels means that nothing was measured"
+        text = f"depth {odd.value} in {odd.share:.1%} of the pixels means that nothing was measured"
         step = "it is read so; 0 would be usual" if odd.is_known else _MEND
-        out.append(RgbdFault("invalid value", odd.value, 0.0, told, step))
+        out.append(RgbdFault("invalid value", odd.value, 0.0, text, step))
     if not np.isnan(facts.median_depth_m) and not _DEPTHS_M[0] <= facts.median_depth_m <= _DEPTHS_M[1]:
-        told = f"half of the depths are below {facts.median_depth_m:.3g} m: the unit is wrong"
-        out.append(RgbdFault("unit", facts.median_depth_m, 0.0, told, "correct depth_units_per_m"))
+        text = f"half of the depths are below {facts.median_depth_m:.3g} m: the unit is wrong"
+        out.append(RgbdFault("unit", facts.median_depth_m, 0.0, text, "correct depth_units_per_m"))
     return out
 
 
@@ -81,13 +81,13 @@ def _place_faults(facts: RgbdFacts, width_px: int) -> list[RgbdFault]:
     size_px = float(np.linalg.norm(facts.offset_px))
     sigma_px = float(np.linalg.norm(edges.offset_sigma_px))
     if sure.offset and size_px > max(_MOST_OFFSET * width_px, _SURE * sigma_px):
-        told = f"depth is not registered to colour: it lies {offset_words(facts.offset_px)} off, ± {sigma_px:.1f} px"
-        out.append(RgbdFault("offset", size_px, sigma_px, told))
+        text = f"depth is not registered to colour: it lies {offset_words(facts.offset_px)} off, ± {sigma_px:.1f} px"
+        out.append(RgbdFault("offset", size_px, sigma_px, text))
     if sure.lag and abs(facts.lag_s) > max(_MOST_LAG_S, _SURE * edges.lag_sigma_s):
         word = "late" if facts.lag_s > 0.0 else "early"
         size_ms, sigma_ms = 1e3 * abs(facts.lag_s), 1e3 * edges.lag_sigma_s
-        told = f"depth is {size_ms:.0f} ± {sigma_ms:.0f} ms {word} against colour"
-        out.append(RgbdFault("lag", facts.lag_s, edges.lag_sigma_s, told))
+        text = f"depth is {size_ms:.0f} ± {sigma_ms:.0f} ms {word} against colour"
+        out.append(RgbdFault("lag", facts.lag_s, edges.lag_sigma_s, text))
     return out
 
 
@@ -100,8 +100,8 @@ def _focal_faults(facts: RgbdFacts) -> list[RgbdFault]:
     if abs(off) <= max(_MOST_FOCAL, _SURE * sigma):
         return []
     word = "long" if off > 0.0 else "short"
-    told = f"the focal length is {abs(off):.1%} ± {sigma:.1%} too {word} for how points with depth move"
-    return [RgbdFault("focal length", off, sigma, told)]
+    text = f"the focal length is {abs(off):.1%} ± {sigma:.1%} too {word} for how points with depth move"
+    return [RgbdFault("focal length", off, sigma, text)]
 
 
 def offset_words(offset_px: np.typing.NDArray[np.float64]) -> str:
@@ -111,7 +111,7 @@ def offset_words(offset_px: np.typing.NDArray[np.float64]) -> str:
 
 
 def rgbd_findings(found: Survey, frames: FrameTable | None) -> list[Finding]:
-    """Return what `vislam doctor` tells of colour against depth; nothing without depth or calibration."""
+    """Return what `vislam doctor` reports of colour against depth; nothing without depth or calibration."""
     rig = found.rig
     if rig is None or found.depth is None or frames is None or not np.any(frames.depth_rows >= 0):
         return []
@@ -120,7 +120,7 @@ def rgbd_findings(found: Survey, frames: FrameTable | None) -> list[Finding]:
     except DataError as error:
         return [Finding("error", str(error), "depth0", "see docs/formats.md")]
     faults = rgbd_faults(facts, rig.cameras[0].width)
-    out = [Finding("warning", fault.told, "depth0", fault.next_step) for fault in faults]
+    out = [Finding("warning", fault.text, "depth0", fault.next_step) for fault in faults]
     wrong = {fault.what for fault in faults}
     sure, edges, focal = known(facts), facts.edges, facts.focal
     good, unknown = [], []
@@ -132,9 +132,9 @@ def rgbd_findings(found: Survey, frames: FrameTable | None) -> list[Finding]:
         elif what == "lag" and what not in wrong and edges is not None:
             good.append(f"lags it by {1e3 * facts.lag_s:.0f} ± {1e3 * edges.lag_sigma_s:.0f} ms")
         elif what == "focal length" and what not in wrong and focal is not None:
-            good.append(f"fits a focal length of {focal.factor:.3f} ± {focal.sigma:.3f} times the one told")
+            good.append(f"fits a focal length of {focal.factor:.3f} ± {focal.sigma:.3f} times the given one")
     out += [Finding("ok", ", ".join(good), "depth0")] if good else []
     if unknown:
-        told = f"colour and depth do not tell {' or '.join(unknown)}: too little motion, texture or foreground"
-        out.append(Finding("ok", told, "depth0"))
+        text = f"colour and depth do not show {' or '.join(unknown)}: too little motion, texture or foreground"
+        out.append(Finding("ok", text, "depth0"))
     return out

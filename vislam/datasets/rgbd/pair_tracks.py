@@ -18,7 +18,7 @@ from vislam.vision.features import FlowSettings, detect_corners, follow
 
 _BLOCK = 40  # frames in a row
 _MOST_FRAMES = 480
-_FLOW_EVERY = 4  # frames: so many have their dense flow computed
+_FLOW_EVERY = 4  # frames: one of this many has its dense flow computed
 _NEW_KEY_S = 0.25
 _LONGEST_S = 1.0  # of a pair
 _KEPT = 0.4  # of the corners of a first view: with fewer, the pair is finished

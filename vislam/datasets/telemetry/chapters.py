@@ -33,7 +33,7 @@ class Chapter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Film:
-    """The chapters of a recording, and what is to be told of them."""
+    """The chapters of a recording, and what is to be reported of them."""
 
     chapters: tuple[Chapter, ...]
     findings: tuple[Finding, ...] = ()
@@ -70,7 +70,7 @@ def joined_film(path: Path) -> Film:
     Raises DataError when the first chapter has no table of frame times; a later one that has none ends the film.
     """
     later, why = later_chapters(path)
-    told = [Finding("warning", why, path.name, "copy all chapters into one folder")] if why else []
+    findings = [Finding("warning", why, path.name, "copy all chapters into one folder")] if why else []
     first = frame_times_ns(path)
     chapters = [Chapter(path, 0, 0, first)]
     for one in later:
@@ -80,7 +80,7 @@ def joined_film(path: Path) -> Film:
             if not len(frames_ns) or len(before.frames_ns) < 2:
                 raise DataError(f"{one} has no frames")
         except DataError as error:
-            told.append(Finding("warning", f"the film ends before {one.name}: {error}", one.name, "copy it again"))
+            findings.append(Finding("warning", f"the film ends before {one.name}: {error}", one.name, "copy it again"))
             break
         period_ns = int(before.frames_ns[-1] - before.frames_ns[-2])
         begins_ns = int(before.frames_ns[-1]) + period_ns - int(frames_ns[0])
@@ -88,8 +88,8 @@ def joined_film(path: Path) -> Film:
         chapters.append(Chapter(one, begins_ns, number, frames_ns + begins_ns))
     if len(chapters) > 1:
         names = ", ".join(chapter.path.name for chapter in chapters)
-        told.insert(0, Finding("ok", f"{len(chapters)} chapters are one film: {names}", path.name, ""))
-    return Film(tuple(chapters), tuple(told))
+        findings.insert(0, Finding("ok", f"{len(chapters)} chapters are one film: {names}", path.name, ""))
+    return Film(tuple(chapters), tuple(findings))
 
 
 class JoinedTelemetry:
@@ -111,11 +111,11 @@ class JoinedTelemetry:
         return sum(part.fix_count for part, _ in self._parts)
 
     def findings(self) -> list[Finding]:
-        """Return what doctor tells: of the first chapter, and what the others lack."""
-        told = self._parts[0][0].findings()
+        """Return what doctor reports: of the first chapter, and what the others lack."""
+        findings = self._parts[0][0].findings()
         for part, _ in self._parts[1:]:
-            told += [finding for finding in part.findings() if finding.severity != "ok"]
-        return told
+            findings += [finding for finding in part.findings() if finding.severity != "ok"]
+        return findings
 
     def imu_rows(self, problems: Problems) -> Rows:
         """Yield stamp (ns since the film began), rates and forces as `Telemetry.imu_rows`, across the chapters."""

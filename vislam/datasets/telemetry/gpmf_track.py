@@ -1,6 +1,6 @@
 """Inertial samples and GNSS fixes in the GPMF track of a GoPro's video, by the video's own clock.
 
-GPMF has no stamp per sample. Newer cameras tell when the first sample of each payload was taken (STMP, microseconds):
+GPMF has no stamp per sample. Newer cameras state when the first sample of each payload was taken (STMP, microseconds):
 the others lie evenly up to the next payload. For older ones a line is fitted to how many samples there were by the end
 of each payload of the MP4, as gpmf-parser does, for payloads are cut by a clock of their own.
 """
@@ -35,7 +35,7 @@ _UNITS = {
     "GYRO": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "\u00b0/s": math.pi / 180.0},
 }
 _USUAL_UNIT = {"ACCL": "m/s^2", "GYRO": "rad/s"}
-# of cameras that do not tell it (ORIN): gpmf-parser's tables; the first camera's is what all others are turned into
+# of cameras that do not state it (ORIN): gpmf-parser's tables; the first camera's is what all others are turned into
 _AXES_BY_DEVICE = {"fusion": "yXZ"}  # whose streams are named as those of HERO5, which has another order
 _USUAL_AXES = "ZXY"
 _USUAL_NAMES = ("(up/down, right/left, forward/back)", "(z,x,y)")  # in the name of a stream
@@ -157,23 +157,23 @@ class Telemetry:
                 yield _fix(t_ns, sample, stream)
 
     def findings(self) -> list[Finding]:
-        """Return what doctor tells."""
+        """Return what doctor reports."""
         where = self.path.name
-        told = []
+        findings = []
         if self.has_imu:
             rates = ", ".join(f"{name} {self._rate_hz(key):.0f} Hz" for name, key in _NAMES)
             by = "stamped by the camera (STMP)" if self._is_stamped("GYRO") else "stamped by the count of samples"
-            told.append(Finding("ok", f"telemetry of {self._device or 'a camera'}: {rates}, {by}", where))
-            told += self._doubts()
+            findings.append(Finding("ok", f"telemetry of {self._device or 'a camera'}: {rates}, {by}", where))
+            findings += self._doubts()
         else:
-            told.append(Finding("warning", "telemetry without gyroscope and accelerometer", where, "vision alone"))
+            findings.append(Finding("warning", "telemetry without gyroscope and accelerometer", where, "vision alone"))
         if self.fix_count:
             text = f"telemetry: {self.fix_count} GNSS samples, {self._in_space[self._fix_key]} with a fix in space"
-            told.append(Finding("ok", f"{text}; to use them name {where} in a sensors file", where))
+            findings.append(Finding("ok", f"{text}; to use them name {where} in a sensors file", where))
         if self._damaged:
             what = f"{self._damaged} payloads of telemetry are damaged"
-            told.append(Finding("warning", what, where, "their samples are left out; copy the file again"))
-        return told
+            findings.append(Finding("warning", what, where, "their samples are left out; copy the file again"))
+        return findings
 
     @property
     def _fix_key(self) -> str:
@@ -227,8 +227,8 @@ class Telemetry:
         by_count = _by_count(counted, counts, begins_s, ends_s)
         begin_s, period_s = self._by_stamps(counted, counts, by_count[1]) or by_count
         known = zip(payloads.tolist(), begin_s.tolist(), period_s.tolist(), strict=True)
-        told = [(index, begin, period) for index, begin, period in known if math.isfinite(begin) and period > 0.0]
-        return _Times({i: begin for i, begin, _ in told}, {i: period for i, _, period in told})
+        known = [(index, begin, period) for index, begin, period in known if math.isfinite(begin) and period > 0.0]
+        return _Times({i: begin for i, begin, _ in known}, {i: period for i, _, period in known})
 
     def _by_stamps(self, counted: _Counted, counts: NDArray[np.int64], usual_s: Array) -> tuple[Array, Array] | None:
         """Return begin and period of each payload by the camera's own stamps; None where they cannot be used."""
@@ -264,24 +264,24 @@ class Telemetry:
         return stamps
 
     def _unit(self, key: str, stream: Stream) -> float:
-        told = stream.text("SIUN") or stream.text("UNIT") or _USUAL_UNIT[key]
+        given = stream.text("SIUN") or stream.text("UNIT") or _USUAL_UNIT[key]
         for unit, factor in _UNITS[key].items():
-            if told.startswith(unit):
+            if given.startswith(unit):
                 return factor
-        raise DataError(f"{self.path}: {key} of its telemetry is in '{told[:20]}', {' or '.join(_UNITS[key])} is read")
+        raise DataError(f"{self.path}: {key} of its telemetry is in '{given[:20]}', {' or '.join(_UNITS[key])} is read")
 
     def _doubts(self) -> list[Finding]:
         doubts = []
         for name, key in _NAMES:
             example = self._counted[key].example
             assert example is not None
-            if told := _axes(example)[1]:
+            if doubt := _axes(example)[1]:
                 doubts.append(
-                    Finding("warning", f"{name}: {told}", self.path.name, "compare the turns that doctor tells")
+                    Finding("warning", f"{name}: {doubt}", self.path.name, "compare the turns that doctor reports")
                 )
             if not (example.text("SIUN") or example.text("UNIT")):
                 doubts.append(
-                    Finding("warning", f"{name}: no unit is told, {_USUAL_UNIT[key]} taken", self.path.name, "")
+                    Finding("warning", f"{name}: no unit is stated, {_USUAL_UNIT[key]} taken", self.path.name, "")
                 )
         return doubts
 
@@ -297,13 +297,13 @@ def _of_key(streams: list[Stream], key: str) -> Stream | None:
 def _by_count(counted: _Counted, counts: NDArray[np.int64], begins_s: Array, ends_s: Array) -> tuple[Array, Array]:
     """Return begin and period of each payload by a line through how many samples there were at each end."""
     summed = np.cumsum(counts)
-    told = [total for total in counted.totals if total is not None]
+    stated = [total for total in counted.totals if total is not None]
     totals = summed
-    if len(told) == len(counts):
-        since_first = np.array(told, dtype=object) - told[0] + int(counts[0])  # of any size in a damaged file
+    if len(stated) == len(counts):
+        since_first = np.array(stated, dtype=object) - stated[0] + int(counts[0])  # of any size in a damaged file
         if all(0 < int(t) < 2**40 for t in since_first):
-            as_told = since_first.astype(np.int64)
-            totals = as_told if (np.diff(as_told) >= counts[1:]).all() else summed
+            as_stated = since_first.astype(np.int64)
+            totals = as_stated if (np.diff(as_stated) >= counts[1:]).all() else summed
     if len(counts) == 1:
         return begins_s, (ends_s - begins_s) / counts
     mean_n, mean_s = totals.mean(), ends_s.mean()
@@ -332,7 +332,7 @@ def _axes(stream: Stream) -> tuple[Array, str]:
         return _placed(known), ""
     if any(name in stream.text("STNM") for name in _USUAL_NAMES):
         return _placed(_USUAL_AXES), ""
-    return _placed(_USUAL_AXES), f"the order of its axes is not told (ORIN), HERO5's {_USUAL_AXES} taken"
+    return _placed(_USUAL_AXES), f"the order of its axes is not stated (ORIN), HERO5's {_USUAL_AXES} taken"
 
 
 def _is_order(text: str) -> bool:
@@ -349,12 +349,12 @@ def _placed(order: str) -> Array:
 
 def _fix(t_ns: int, sample: Array, stream: Stream) -> Fix:
     """Return a sample of GPS5 or GPS9 as a fix; one that is not in space has no place."""
-    told = stream.number("GPSF") if len(sample) < 9 else _whole(sample[8])
+    fix_type = stream.number("GPSF") if len(sample) < 9 else _whole(sample[8])
     precision = stream.number("GPSP")
     dop = math.nan if precision is None else precision / 100.0
     if len(sample) >= 9:
         dop = float(sample[7])
-    in_space = told == 3 and len(sample) >= 3 and bool(np.isfinite(sample[:3]).all())
+    in_space = fix_type == 3 and len(sample) >= 3 and bool(np.isfinite(sample[:3]).all())
     place = Geodetic(*sample[:3].tolist()) if in_space else Geodetic(0.0, 0.0, 0.0)
     return Fix(t_ns, place, "single" if in_space else "none", hdop=dop)
 

@@ -1,7 +1,7 @@
 """GPMF, GoPro's metadata: keys, types, sizes and values, big-endian, in multiples of four bytes.
 
 After the description that GoPro publishes with gpmf-parser. A payload is a tree of devices (DEVC) and streams (STRM);
-in a stream, everything before its last value says how that one is meant.
+in a stream, everything before its last value describes that one.
 """
 
 from __future__ import annotations

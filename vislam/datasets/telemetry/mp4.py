@@ -209,7 +209,7 @@ def _sizes(box: memoryview, file_bytes: int) -> Integers:
 
 
 def _expanded(runs: Integers, count: int) -> Integers:
-    """Return the second column repeated as the first one says, for `count` samples."""
+    """Return the second column repeated as the first one counts, for `count` samples."""
     repeats = np.minimum(runs[:, 0], count)
     if repeats.sum() < count:
         raise ValueError("a table of fewer samples than there are")

@@ -46,7 +46,7 @@ class Mavlink:
         self._heartbeat_ns = 0
 
     def send(self, pose: PublishedPose) -> None:
-        """Send the pose; where nobody listens, nothing happens."""
+        """Send the pose; without a listener, nothing happens."""
         if pose.published_ns >= self._heartbeat_ns:
             self._heartbeat_ns = pose.published_ns + _HEARTBEAT_NS
             self._send(
@@ -61,7 +61,7 @@ class Mavlink:
         self._link.seq = (self._link.seq + 1) % 256
         try:
             self._socket.sendto(data, self._address)
-        except OSError:  # nobody listens there (yet), or too slowly
+        except OSError:  # no listener there (yet), or one that is too slow
             return
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ class Wire(Protocol):
     """A translator and where it sends to."""
 
     def send(self, pose: PublishedPose) -> None:
-        """Send what the pose says."""
+        """Send the pose in the translator's format."""
         ...
 
     def close(self) -> None:

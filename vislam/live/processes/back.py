@@ -1,4 +1,4 @@
-"""The process of loops and graph: as slow as it has to be, and nobody waits for it."""
+"""The process of loops and graph: as slow as it has to be, and no other process waits for it."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def run(
             if begins_recording:
                 continue  # ended before gravity was known
         step = back.add(keyframe.odometry, [])
-        _tell(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
+        _send(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
         _put(life, outbox, step)
     if back is None:
         ended = BackEnded(None, None, None, {}, clock.summary_ms())
@@ -88,7 +88,7 @@ def _next(life: Life, keyframes: Inbox) -> KeyframeOut | None:
     return None
 
 
-def _tell(to_fast: Connection, message: MapMoved) -> None:
+def _send(to_fast: Connection, message: MapMoved) -> None:
     try:
         to_fast.send(message)
     except OSError:  # the pose is not published any more; the map is finished all the same

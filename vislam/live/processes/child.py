@@ -34,7 +34,7 @@ class Ready:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something to tell the user while it runs."""
+    """Values to show the user while it runs."""
 
     role: str
     values: dict[str, Any]
@@ -74,15 +74,15 @@ class Flag:
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """What the parent tells all."""
+    """What the parent signals to all."""
 
     go: Flag  # every process is ready
     stop: Flag
-    brief: Flag = field(default_factory=Flag)  # nobody waits for the end: what takes time is left for later
+    brief: Flag = field(default_factory=Flag)  # the end must come soon: what takes time is left for later
 
 
 class Life:
-    """Tells a child whether to go on, and its parent how it is."""
+    """Shows a child whether to go on, and its parent the child's state."""
 
     def __init__(self, role: str, report: Connection, signals: Signals) -> None:
         """Keep the parent's id: with another parent, the old one is dead."""
@@ -98,7 +98,7 @@ class Life:
 
     @property
     def stopped(self) -> bool:
-        """Whether the run is to end, because somebody said so or the parent is gone."""
+        """Whether the run is to end, because the parent asked for it or is gone."""
         return self._signals.stop.is_set() or self.is_orphan
 
     @property
@@ -117,7 +117,7 @@ class Life:
     def ready(self) -> bool:
         """Say that everything is loaded, wait for the others; False when the run ends before."""
         self.when_ready()
-        self.tell(Ready(self.role))
+        self.send(Ready(self.role))
         _die_with_parent(False)  # from now on it looks after that itself, and ends in order
         while not self._signals.go.wait(0.1):
             if self.stopped:
@@ -125,10 +125,10 @@ class Life:
         return True
 
     def note(self, **values: Any) -> None:
-        """Tell the parent something to show."""
-        self.tell(Note(self.role, values))
+        """Send the parent values to show."""
+        self.send(Note(self.role, values))
 
-    def tell(self, message: Ready | Note | Failure | logging.LogRecord) -> None:
+    def send(self, message: Ready | Note | Failure | logging.LogRecord) -> None:
         """Send a message; a parent that is gone needs none."""
         try:
             with self._sending:
@@ -148,10 +148,10 @@ def guarded(
     _die_with_parent(True)
     life = Life(role, report, signals)
     try:
-        with log_through(life.tell, log_level):
+        with log_through(life.send, log_level):
             body(life)
     except Exception as error:
-        life.tell(Failure(role, _portable(error), traceback.format_exc()))
+        life.send(Failure(role, _portable(error), traceback.format_exc()))
         raise SystemExit(1) from None
 
 
@@ -181,7 +181,7 @@ def _portable(error: Exception) -> Exception | None:
 
 
 def measured(life: Life, body: Callable[[Life], None]) -> None:
-    """Run the body of a process and tell what the process cost, however the body ends.
+    """Run the body of a process and report what the process cost, however the body ends.
 
     `late_kernels` is how often, between ready and over, a kernel was called for the first time (twice as often where
     it is compiled): what had been rehearsed is 0.

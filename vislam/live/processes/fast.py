@@ -56,7 +56,7 @@ def run(
         samples: to the front process.
         inbox: from the front and the back process.
         memory: gyro biases that earlier power-ups found.
-        is_mag_calibrated: whether what the magnetometer says may be used.
+        is_mag_calibrated: whether the magnetometer's values may be used.
         suite: further sensors, which another process reads.
     """
     warm_up(config, noise, T_body_camera)

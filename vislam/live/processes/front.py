@@ -68,7 +68,7 @@ def run(
     beginning: Beginning | None,
     to_web: Connection | None = None,
 ) -> None:
-    """Process frames until the samples end; then tell the back and the map process that there are no more.
+    """Process frames until the samples end; then signal the back and the map process that there are no more.
 
     Args:
         life: of this process.
@@ -131,7 +131,7 @@ class FrontProcess:
             for reading in readings.read():
                 self.front.add(reading)
             samples.receive(self._take)
-            self._tell_readings()
+            self._send_readings()
             self._follow_sensors(readings)
             frame = camera.read(_READ_S)
             if frame is not None and self._pace.wants(frame):
@@ -143,7 +143,7 @@ class FrontProcess:
                 self._process(self._frames.popleft())
 
     def end(self) -> None:
-        """Process what still waits, as far as somebody does for that."""
+        """Process what still waits, unless the run has to end soon."""
         while self._frames and not self._life.is_brief:
             self._process(self._frames.popleft())
         for odometry in self.front.give_up_waiting():
@@ -205,7 +205,7 @@ class FrontProcess:
             )
 
     def _correct(self, step: FrontStep) -> None:
-        """Tell the fast process's filter what this one was told."""
+        """Send the fast process's filter what was applied to this one."""
         found = self.front.begun.newest
         if found is not self._told_start and found is not None and found.last is not None:
             self._told_start = found
@@ -219,11 +219,11 @@ class FrontProcess:
         for correction in step.corrections:
             self._send(replace(correction, observations=no_observations()))
 
-    def _tell_readings(self) -> None:
-        """Tell the fast process's filter what this one was told by further sensors; `Rebase` has it in its state."""
-        for told in self.front.take_applied_readings():
+    def _send_readings(self) -> None:
+        """Send the fast process's filter the readings applied to this one; `Rebase` has them in its state."""
+        for applied in self.front.take_applied_readings():
             if self.front.config.ekf.coupling != "tight":
-                self._send(told)
+                self._send(applied)
 
     def _follow_sensors(self, readings: ReadingSource) -> None:
         """Note once a second how the further sensors are, and which of them slip."""
@@ -234,7 +234,7 @@ class FrontProcess:
             self._life.note(sensors=status | doubts)
 
     def _judge(self, t_ns: int) -> None:
-        """Tell the pose whether the run so far is to be doubted, and people why; nothing while it begins."""
+        """Mark the pose as doubtful or not, and log why; nothing while the run begins."""
         if self.front.begun.settled is None or t_ns - self._judged_t_ns < _JUDGE_NS:
             return
         self._judged_t_ns = t_ns
@@ -263,7 +263,7 @@ class FrontProcess:
     def _send(self, message: ToFast) -> None:
         try:
             self._to_fast.send(message)
-        except OSError:  # the fast process has ended; the end of the samples says so in a moment
+        except OSError:  # the fast process has ended; the end of the samples follows in a moment
             return
 
     def _first(self) -> tuple[Any, Any]:

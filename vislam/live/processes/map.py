@@ -1,4 +1,4 @@
-"""The process of map, viewer and run folder: it follows what front and back tell, and writes everything down."""
+"""The process of map, viewer and run folder: it follows front and back, and writes all files."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class _LiveRun(Run):
         self.base = {"path": str(beginning.session), "keyframes": beginning.first_id, "localize_only": False}
 
     def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
-        """Write all files; without map and pictures where nobody waits for them."""
+        """Write all files; without map and pictures where the run has to end soon."""
         return super()._finish(start, is_brief or self._followed.life.is_brief)
 
     def _feed(self, progress: Progress | None) -> None:
@@ -122,7 +122,7 @@ class _LiveRun(Run):
 
     @property
     def _frames_due(self) -> int:
-        """All frames; where nobody waits for the end, those whose keyframes the graph had got by then."""
+        """All frames; where the run has to end soon, those whose keyframes the graph had got by then."""
         back = self._followed.back
         if not self._followed.life.is_brief or back is None:
             return super()._frames_due
@@ -181,7 +181,7 @@ class _Back:
 
 
 class FollowedPipeline:
-    """The pipeline as the other processes tell it; see `vislam.runs.Pipeline`.
+    """The pipeline as the other processes report it; see `vislam.runs.Pipeline`.
 
     Keyframes come when the graph has them, later than their frames; the frame that is at hand then carries them.
     """
@@ -241,7 +241,7 @@ class FollowedPipeline:
             message = self._frames.get(_WAIT_S)
             if message is None:
                 if self._frames.is_over:
-                    raise HardwareError("the front process died; what it had not told yet is lost")
+                    raise HardwareError("the front process died; what it had not handed on yet is lost")
                 continue
             if isinstance(message, FrontEnded):
                 self.front.ended, self.front.start, self.front.learned = message, message.start, message.learned

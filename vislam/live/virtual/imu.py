@@ -43,7 +43,7 @@ class VirtualGy85:
         return self._driver.temperature_c
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Tell the driver."""
+        """Pass the zero on to the driver."""
         self._driver.zeroed_at(temperature_c, gyro_per_c)
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:

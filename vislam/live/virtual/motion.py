@@ -1,7 +1,7 @@
 """How the virtual cart moves: a unicycle whose wheels follow commands, exact at every instant and in every process.
 
 Time is cut into segments of constant accelerations, decided a little ahead. The process that steers publishes the last
-seconds of them; whoever needs the truth (chips, camera, evaluation) evaluates the same segments, so all agree.
+seconds of them; all that need the truth (chips, camera, evaluation) evaluate the same segments, so all agree.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SEGMENT_S = 0.05
 LEAD = 2  # segments decided ahead: a command takes 0.1 to 0.15 s to act, as on a real cart
 _KEPT = 120  # segments that are published: 6 s
 _COLUMNS = 8
-_FIRST_S = 60.0  # that somebody who follows waits for the first one
+_FIRST_S = 60.0  # that a follower waits for the first one
 _GAUSS = np.polynomial.legendre.leggauss(4)  # over 50 ms at 1 rad/s its error is below a nanometre
 
 
@@ -121,7 +121,7 @@ class Follower:
         follower._read()
         while not follower._segments:  # the memory is there a moment before what is in it
             if time.monotonic() > deadline:
-                raise DataError(f"the virtual cart tells nothing in {name}; was its process stopped?")
+                raise DataError(f"the virtual cart publishes no motion in {name}; was its process stopped?")
             time.sleep(0.01)
             follower._read()
         return follower

@@ -31,7 +31,7 @@ class CommandWriter:
 
 
 class CommandReader:
-    """Reads commands; one that does not change for too long means that nobody steers."""
+    """Reads commands; one that does not change for too long means that it is not steered."""
 
     def __init__(self, name: str, timeout_s: float = 0.5) -> None:
         self._name, self._timeout_s = name, timeout_s
@@ -40,7 +40,7 @@ class CommandReader:
         self._since_s = 0.0
 
     def newest(self, now_s: float) -> tuple[float, float]:
-        """Return speed and rate to drive with at a time; zero when nobody steers."""
+        """Return speed and rate to drive with at a time; zero when it is not steered."""
         if self._slot is None:
             try:
                 self._slot = SlotReader(self._name)

@@ -24,7 +24,7 @@ class PlaceOptions:
     """What can be chosen about the virtual cart."""
 
     rig: Literal["mono", "rgbd", "none"] = "mono"  # none: no camera, attitude by the IMU alone
-    camera_hz: Annotated[float, Field(gt=0.5, le=60.0)] = 10.0  # less where the machine cannot render so many
+    camera_hz: Annotated[float, Field(gt=0.5, le=60.0)] = 10.0  # less where the machine cannot render as many
     image_width_px: Annotated[int, Field(ge=64, le=1280, multiple_of=4)] = 320
     camera_delay_s: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0  # that stamps are late by
     laps: Annotated[int, Field(ge=0, le=1000)] = 2  # of 26 m; 0: it stands
@@ -47,6 +47,6 @@ def make_scene(seed: int) -> Scene:
 
 
 def course(laps: int) -> Array:
-    """Return the way [N, 2] of so many laps, dense; it begins where the cart stands, heading along x."""
+    """Return the way [N, 2] of a number of laps, dense; it begins where the cart stands, heading along x."""
     points = [(-1.2, -2.6), *(_LAP * max(laps, 1)), (0.2, -2.65)]
     return rounded_path(points, 0.9).xy_m

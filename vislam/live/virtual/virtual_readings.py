@@ -18,7 +18,7 @@ from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.simulated import slipping, within
 
 _NS = 1_000_000_000
-_KNOWN_S = 5.0  # of the motion; whoever asks later missed what was before
+_KNOWN_S = 5.0  # of the motion; a later query misses what was before
 
 
 class VirtualReadings:
@@ -49,7 +49,7 @@ class VirtualReadings:
                     continue
                 body = body_at(self._follower.at(t_s), begin_ns + round(t_s * _NS))
                 sensor, faults = self._setup.sensors[name], self._setup.simulated_faults[name]
-                if not self._is_placed[name]:  # about where it begins: nobody knows yet where it will drive
+                if not self._is_placed[name]:  # about where it begins: where it will drive is unknown yet
                     self._own[name] = sensor.about(body.position_m[None], self._own[name])
                     self._is_placed[name] = True
                 values = sensor.draw(body, self._own[name].copy(), self._rngs[name])
@@ -64,11 +64,11 @@ class VirtualReadings:
         return self._heard.status()
 
     def counters(self) -> dict[str, dict[str, int]]:
-        """Return how many readings of each sensor were drawn, and how many nobody asked for in time."""
+        """Return how many readings of each sensor were drawn, and how many were not asked for in time."""
         return {name: {"drawn": count, "missed": self._missed[name]} for name, count in self._heard.count.items()}
 
     def datums(self) -> dict[str, Geodetic]:
-        """Return nothing: what is told is known without them."""
+        """Return nothing: all is known without them."""
         return {}
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What browsers are told of a run: the newest of everything, bounded, under one lock."""
+"""What browsers see of a run: the newest of everything, bounded, under one lock."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _STATES = ("ok", "degraded", "lost")
 
 
 class Feed:
-    """Takes what processes tell, and answers requests; both may be called from any thread."""
+    """Takes updates of processes, and answers requests; both may be called from any thread."""
 
     def __init__(self) -> None:
         """Know nothing yet."""
@@ -45,7 +45,7 @@ class Feed:
         self._saved: deque[Saved] = deque(maxlen=4)
 
     def take(self, update: object) -> None:
-        """Take what a process told."""
+        """Take an update of a process."""
         with self._lock:
             if isinstance(update, Status):
                 self._status = update.values
@@ -80,18 +80,18 @@ class Feed:
         with self._lock:
             return {
                 **self._status,
-                "pose": None if self._pose is None else self._told_pose(self._pose),
+                "pose": None if self._pose is None else self._pose_json(self._pose),
                 "picture": self._pictures,
-                "path": self._path.told(query),
+                "path": self._path.answer(query),
                 "map": self._map.summary(),
-                "frame": None if self._frame is None else self._told_frame(self._frame),
+                "frame": None if self._frame is None else self._frame_json(self._frame),
                 "saved": [{"text": saved.text, "is_well": saved.is_well} for saved in self._saved],
             }
 
     def map(self, query: Mapping[str, str]) -> dict[str, Any]:
         """Return what changed in the map since `since` of `epoch`; `more` where that is only a part."""
         with self._lock:
-            return self._map.told(query)
+            return self._map.answer(query)
 
     def seen(self) -> dict[str, Any]:
         """Return what vision saw lately: seconds, inliers, state."""
@@ -112,7 +112,7 @@ class Feed:
     def _begin(self, t_ns: int) -> None:
         self._zero_ns = t_ns if self._zero_ns is None else self._zero_ns
 
-    def _told_pose(self, pose: PublishedPose) -> dict[str, Any]:
+    def _pose_json(self, pose: PublishedPose) -> dict[str, Any]:
         T = pose.T_map_base
         return plain({
             "t_s": (pose.t_ns - (self._zero_ns or 0)) * _NS,
@@ -124,7 +124,7 @@ class Feed:
             "health": [(flag.name or "").lower() for flag in pose.health],
         })  # fmt: skip
 
-    def _told_frame(self, frame: FrameUpdate) -> dict[str, Any]:
+    def _frame_json(self, frame: FrameUpdate) -> dict[str, Any]:
         return {
             "t_s": (frame.t_ns - (self._zero_ns or 0)) * _NS,
             "has_picture": bool(frame.jpeg),
@@ -151,7 +151,7 @@ class _Path:
             self._points = self._points[::2]
             self._epoch, self._step_m = self._epoch + 1, 2.0 * self._step_m
 
-    def told(self, query: Mapping[str, str]) -> dict[str, Any]:
+    def answer(self, query: Mapping[str, str]) -> dict[str, Any]:
         has = _count(query, "path") if _count(query, "epoch") == self._epoch else 0
         new = np.array(self._points[has:], dtype=np.float64).reshape(-1, 3)
         return {"epoch": self._epoch, "from": min(has, len(self._points)), "xyz": floats(new)}
@@ -186,7 +186,7 @@ class _Keyframes:
         return max(_FEWEST_EACH, MOST_POINTS // (1 << max(len(self._clouds) - 1, 0).bit_length()))
 
     def _thin(self) -> None:
-        """Forget every second keyframe; browsers begin anew."""
+        """Forget every second keyframe; browsers begin again."""
         kept = {*sorted(self._poses)[::2]}
         self._poses = {i: value for i, value in self._poses.items() if i in kept}
         self._clouds = {i: value for i, value in self._clouds.items() if i in kept}
@@ -208,7 +208,7 @@ class _Keyframes:
             "left_out": self._left_out,
         }
 
-    def told(self, query: Mapping[str, str]) -> dict[str, Any]:
+    def answer(self, query: Mapping[str, str]) -> dict[str, Any]:
         since = _count(query, "since") if _count(query, "epoch") == self._epoch else 0
         clouds: dict[str, dict[str, Any]] = {}
         points, until, until_last = 0, self._revision, since

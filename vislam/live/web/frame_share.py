@@ -1,4 +1,4 @@
-"""What the front process puts into the page's wire: small pictures, left out where nobody takes them."""
+"""What the front process puts into the page's wire: small pictures, left out without a reader."""
 
 from __future__ import annotations
 

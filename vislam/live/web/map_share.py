@@ -1,4 +1,4 @@
-"""What the map process puts into the page's wire: keyframes, points and loops, left out where nobody takes them."""
+"""What the map process puts into the page's wire: keyframes, points and loops, left out without a reader."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class MapShare:
             self._clouds[keyframe_id] = quantised(keyframe_id, points, colors)
 
     def _answer(self, mapper: Mapper | None) -> None:
-        """Do what the page asks for, and tell it what became of that."""
+        """Do what the page asks for, and report the result to it."""
         is_asked = False
         with suppress(EOFError, OSError):
             while not self._box.is_broken and self._asks.poll():
@@ -119,7 +119,7 @@ class MapShare:
 
 
 def quantised(keyframe_id: int, points_m: Array, colors: ImageU8) -> KeyframeCloud:
-    """Return points [N, 3] with RGB [N, 3] as the page takes them: at most so many, in millimetres where that goes."""
+    """Return points [N, 3] with RGB [N, 3] for the page: at most `_CLOUD_POINTS`, in millimetres where that fits."""
     chosen = np.random.default_rng(keyframe_id).permutation(len(points_m))[:_CLOUD_POINTS]
     points = points_m[chosen].astype(np.float64)
     step = max(_STEP_M, float(np.abs(points).max()) / 32767.0)

@@ -17,7 +17,7 @@ _HEAD = (
 )
 _SIGN_IN = (
     _HEAD + '<script type="module" src="/sign_in.js"></script></head><body><main class="sign-in"><h1>vislam live</h1>'
-    "<p>The run told the whole address, with the token in it, where it was started.</p>"
+    "<p>The run printed the whole address, with the token in it, where it was started.</p>"
     '<form id="form"><label for="token">Token</label><input id="token" autocomplete="off" spellcheck="false" '
     'autocapitalize="none"><button type="submit">Sign in</button></form><p class="note" id="said" role="status"></p>'
     "<noscript><p>This page needs JavaScript.</p></noscript></main></body></html>"

@@ -1,4 +1,4 @@
-"""The bytes of requests, read within bounds: so many for all headers, so long for the whole request."""
+"""The bytes of requests, read within bounds of size for all headers, and of time for the whole request."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RequestReader:
         self.closed = False
 
     def begin(self) -> None:
-        """Expect a new request: with it, bounds begin anew."""
+        """Expect a new request: with it, bounds begin again."""
         self._left = MOST_HEAD_BYTES
         self._is_begun = False
         self._deadline = time.monotonic() + self._idle_s
@@ -54,7 +54,7 @@ class RequestReader:
         return self._take(end + 1)
 
     def read(self, count: int) -> bytes:
-        """Return so many bytes of a body, fewer at the end of the stream; raises as `readline`."""
+        """Return `size` bytes of a body, fewer at the end of the stream; raises as `readline`."""
         if count > MOST_BODY_BYTES:
             raise TooLarge
         while len(self._pending) < count and self._fill():
@@ -62,7 +62,7 @@ class RequestReader:
         return self._take(min(count, len(self._pending)))
 
     def close(self) -> None:
-        """Do nothing: the socket is somebody else's."""
+        """Do nothing: the socket belongs to the caller."""
         self.closed = True
 
     def _fill(self) -> bool:

@@ -84,7 +84,7 @@ class Counters:
 
 
 class WebServer(ThreadingHTTPServer):
-    """Serves at a socket that listens already: a thread for each of at most so many connections."""
+    """Serves at a socket that listens already: a thread for each of a bounded number of connections."""
 
     daemon_threads = True
     block_on_close = False

@@ -1,4 +1,4 @@
-"""The page's side in the process that owns the run: it starts the server, tells it how things are, hears commands."""
+"""The page's side in the process that owns the run: starts the server, sends it the run's state, takes commands."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.wire.mail import Inbox, Outbox
 
 _LOG = logging.getLogger(__name__)
-_TELL_S = 0.1
+_SHOW_S = 0.1
 _LINGER_S = 1.5  # that browsers have to hear of the end
 _NOTICES = 12
 _MAX_TEXT = 300
@@ -56,7 +56,7 @@ class Station:
         frames, to_frames = context.Pipe(duplex=False)
         map_wire, to_map = context.Pipe()
         self.ends = WebEnds(to_frames, to_map)
-        self._report, says = context.Pipe(duplex=False)
+        self._reports, sender = context.Pipe(duplex=False)
         self._signals = Signals(Flag(), Flag())
         self._signals.go.set()
         body = partial(
@@ -64,20 +64,20 @@ class Station:
             pose_name=pose_name,
         )  # fmt: skip
         self._process = context.Process(
-            target=guarded, args=("web", says, self._signals, body, log.level()), name="vislam web"
+            target=guarded, args=("web", sender, self._signals, body, log.level()), name="vislam web"
         )
         before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)  # until it is ready for one
         try:
             self._process.start()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for end in (says, to_owner, frames, map_wire):
+        for end in (sender, to_owner, frames, map_wire):
             end.close()
         listener.close()
         self._box, self._inbox = Outbox(owner, 2), Inbox(owner)
 
-    def tell(self, phase: str, **values: Any) -> None:
-        """Tell browsers how things are; what they were before is forgotten."""
+    def update(self, phase: str, **values: Any) -> None:
+        """Show browsers the run's state; the one before is forgotten."""
         self._watch()
         status = {"phase": phase, "run": self._out.name, "notices": list(self._notices), **values}
         self._box.put(Status(plain(status)))
@@ -87,14 +87,14 @@ class Station:
         self._box.put(StepPicture(jpeg))
 
     def follow(self, run: LiveRun) -> None:
-        """Tell how a run is, a few times a second, and end it where the page asks for that."""
+        """Show a run's state, a few times a second, and end it where the page asks for that."""
         for command in self.asked():
             if command.do == "stop":
                 _LOG.info("the web page asked for the end of the run")
                 run.stop()
         if time.monotonic() >= self._due_s:
-            self._due_s = time.monotonic() + _TELL_S
-            self.tell(_phase(run), **_told(run))
+            self._due_s = time.monotonic() + _SHOW_S
+            self.update(_phase(run), **_values(run))
 
     def asked(self) -> Iterator[Asked]:
         """Yield the commands that have come since."""
@@ -113,10 +113,10 @@ class Station:
             logging.getLogger().removeHandler(handler)
 
     def end(self, metrics: dict[str, Any]) -> None:
-        """Tell browsers that the run is over and what it is worth; they have a moment to hear of it."""
+        """Show browsers that the run is over, with its verdict; they have a moment to fetch it."""
         if self.is_well:
-            told = {name: metrics.get(name) for name in ("frames", "keyframes", "verdict")}
-            self.tell("ended", line="the run folder is written, with its report", **told)
+            verdict = {name: metrics.get(name) for name in ("frames", "keyframes", "verdict")}
+            self.update("ended", line="the run folder is written, with its report", **verdict)
             time.sleep(_LINGER_S)
 
     def close(self) -> None:
@@ -130,10 +130,10 @@ class Station:
             end.close()
 
     def _watch(self) -> None:
-        """Log what the process says, and that it died, once."""
+        """Log the process's messages, and that it died, once."""
         with suppress(EOFError, OSError):
-            while self._report.poll():
-                message = self._report.recv()
+            while self._reports.poll():
+                message = self._reports.recv()
                 if isinstance(message, logging.LogRecord):
                     log.take_record(message)
                 elif isinstance(message, Failure):
@@ -162,7 +162,7 @@ def _phase(run: LiveRun) -> str:
     return "running" if run.is_going else "getting ready"
 
 
-def _told(run: LiveRun) -> dict[str, Any]:
+def _values(run: LiveRun) -> dict[str, Any]:
     waits = {*run.waits_for}
     fast, front, of_map = (run.notes.get(role, {}) for role in ("fast", "front", "map"))
     states = {

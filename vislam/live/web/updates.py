@@ -1,4 +1,4 @@
-"""What the processes of a run tell the one that serves its page. Plain values; nothing here loads a heavy package."""
+"""Messages of a run's processes to the one that serves its page. Plain values; nothing here loads a heavy package."""
 
 from __future__ import annotations
 

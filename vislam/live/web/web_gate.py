@@ -1,6 +1,6 @@
-"""Who may ask the web page for anything: whoever has the token, from the page itself, at a name that is ours.
+"""Access to the web page: with the token, from the page itself, at a name of this machine.
 
-A page of somebody else that is open in the same browser must reach nothing: its requests carry its own Origin and
+A foreign page that is open in the same browser must reach nothing: its requests carry its own Origin and
 Sec-Fetch-Site, and a name of its own that it points at this machine (DNS rebinding) is in Host.
 """
 
@@ -20,7 +20,7 @@ _COOKIE = "vislam-web"
 
 
 def new_token() -> str:
-    """Return a token that nobody can guess."""
+    """Return a token that cannot be guessed."""
     return secrets.token_urlsafe(_TOKEN_BYTES)
 
 
@@ -29,7 +29,7 @@ class Gate:
     """Judges requests by their headers alone.
 
     Attributes:
-        token: whoever knows it may see and steer the run.
+        token: who knows it may see and steer the run.
         port: on which it listens; it is in the cookie's name, for browsers share cookies between ports.
         hosts: names by which the page may be asked for, beside localhost and IP addresses.
     """
@@ -39,7 +39,7 @@ class Gate:
     hosts: frozenset[str] = frozenset()
 
     def refusal(self, headers: Message) -> str | None:
-        """Return why a request is refused whoever sent it; None: it is not."""
+        """Return why a request is refused whatever its token; None: it is not."""
         host = headers.get("Host", "")
         name = _host_name(host)
         if name is None or not (name in {"localhost", *self.hosts} or is_address(name)):
@@ -63,11 +63,11 @@ class Gate:
         return morsel is not None and self.is_token(morsel.value)
 
     def is_token(self, given: object) -> bool:
-        """Return whether this is the token, in a time that does not tell how much of it is right."""
+        """Return whether this is the token, in a time that does not depend on how much of it is right."""
         return isinstance(given, str) and hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def cookie(self) -> str:
-        """Return the header Set-Cookie for whoever has shown the token: no script reads it, no other page sends it."""
+        """Return the header Set-Cookie for a browser with the token: no script reads it, no other page sends it."""
         return f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
     @property

@@ -14,7 +14,7 @@ from typing import Any
 
 
 class Outbox:
-    """Owns the sending end; a thread sends, so that whoever puts something in only waits while it is full."""
+    """Owns the sending end; a thread sends, so that the caller of `put` only waits while it is full."""
 
     def __init__(self, connection: Connection, capacity: int) -> None:
         """Take the connection, to be used in this process only."""

@@ -69,7 +69,7 @@ class PosePublisher:
         self._slot = SlotWriter(name, SIZE)
 
     def publish(self, pose: PublishedPose) -> None:
-        """Hand a pose out; where nobody listens, nothing happens."""
+        """Hand a pose out; without a listener, nothing happens."""
         data = pack(pose)
         self._slot.write(data)
         self.counters["published"] += 1
@@ -78,7 +78,7 @@ class PosePublisher:
                 target.sendto(data, address)
             except BlockingIOError:
                 self.counters["datagrams_refused"] += 1
-            except OSError:  # nobody listens there (yet)
+            except OSError:  # no listener there (yet)
                 continue
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """A place in shared memory that holds the newest value of one writer, for any number of readers.
 
-A sequence counter before and after the value (a seqlock) tells a reader that the writer came in between; a checksum
-tells the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C.
+A sequence counter before and after the value (a seqlock) shows a reader that the writer came in between; a checksum
+shows the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class SlotReader:
     """Reads what a `SlotWriter` of another process wrote last."""
 
     def __init__(self, name: str) -> None:
-        """Open `/dev/shm/NAME`. Raises DataError when nobody has made it."""
+        """Open `/dev/shm/NAME`. Raises DataError when it does not exist."""
         path = _FOLDER / name
         try:
             descriptor = os.open(path, os.O_RDONLY)

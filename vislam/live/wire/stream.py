@@ -78,7 +78,7 @@ class SampleReceiver:
         self.ended = False
 
     def receive(self, take: Callable[[Value], None]) -> None:
-        """Give every value that is here to `take`, in order; `ended` tells whether more will come."""
+        """Give every value that is here to `take`, in order; `ended` states whether more will come."""
         while not self.ended:
             try:
                 data = self._socket.recv(_READ_BYTES)

@@ -157,8 +157,8 @@ class PointRecording:
         span_ns = (self._ns(np.array([self._begin_s, self._end_s]))).tolist()
         self._imu = RecordedImu(recorded.t_ns, recorded.gyro_rad_s, recorded.accel_m_s2, span_ns[0], span_ns[1])
         self.imu_noise = _told(recorded.noise, self.options.imu_noise_factor)
-        if recorded.truth_fit is not None and recorded.truth_fit.told:
-            self.problems[f"{recorded.truth_fit.told}: undone"] = 1
+        if recorded.truth_fit is not None and recorded.truth_fit.summary:
+            self.problems[f"{recorded.truth_fit.summary}: undone"] = 1
 
     def _set_span(self, begin_s: float, end_s: float) -> None:
         options = self.options

@@ -34,15 +34,15 @@ export class LiveMap {
     this.revision = answer.revision;
   }
 
-  takePath(told) {
-    const tail = floats(told.xyz);
-    if (told.epoch === this.pathEpoch && !tail.length) return false;
-    const from = told.epoch === this.pathEpoch ? 3 * told.from : 0;
+  takePath(update) {
+    const tail = floats(update.xyz);
+    if (update.epoch === this.pathEpoch && !tail.length) return false;
+    const from = update.epoch === this.pathEpoch ? 3 * update.from : 0;
     const path = new Float32Array(from + tail.length);
     path.set(this.path.subarray(0, from));
     path.set(tail, from);
     this.path = path;
-    this.pathEpoch = told.epoch;
+    this.pathEpoch = update.epoch;
     return true;
   }
 
