@@ -101,7 +101,7 @@ def test_it_ends_with_a_file_a_picture_and_what_is_known_how_well(
 
 @pytest.mark.parametrize("both", [True, False])
 def test_the_height_has_to_come_from_somewhere(tmp_path: Path, both: bool) -> None:
-    with pytest.raises(UsageError, match="cannot tell the height"):
+    with pytest.raises(UsageError, match="does not show the height"):
         calibrate_floor(FloorOptions("drive", 3.0 if both else None, height_m=0.6 if both else None, out=tmp_path))
 
 

@@ -70,7 +70,7 @@ def test_what_is_measured_twice_is_written_once_and_read_back(tmp_path: Path, mo
     assert survey(str(source)).depth_format == how
     report = json.loads((tmp_path / "out" / "rgbd.json").read_text())
     assert report["focal_sigma"] == 0.004 and not report["units_known"]
-    assert any("unit of depth cannot be told" in line for line in outcome.lines)
+    assert any("unit of depth cannot be found" in line for line in outcome.lines)
     assert {path.name for path in outcome.files} == {"sensor.yaml", "rgbd.png", "rgbd.json"}
     with pytest.raises(UsageError, match="already holds"):
         rgbd.calibrate_rgbd(RgbdOptions(str(source), out=tmp_path / "out"))

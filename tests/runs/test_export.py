@@ -276,7 +276,7 @@ def test_a_damaged_file_is_named_and_no_half_is_left(run, tmp_path, capsys, name
 def test_a_stamp_before_1970_cannot_be_told_in_ros(tmp_path, capsys):
     write_tum(Trajectory(np.array([-5]), np.eye(4)[None]), tmp_path / "trajectory_graph.tum")
     assert run_verb(["export", str(tmp_path), "--mcap", str(tmp_path / "a.mcap")]) == 3
-    assert "a stamp of -5 ns cannot be told in ROS" in capsys.readouterr().err
+    assert "a stamp of -5 ns cannot be expressed in ROS" in capsys.readouterr().err
 
 
 def test_without_rosbags_the_extra_is_named(run, tmp_path, capsys, monkeypatch):

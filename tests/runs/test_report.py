@@ -119,7 +119,7 @@ def test_a_whole_run_becomes_one_self_contained_page(run, drawn):
     metrics = json.loads((run / "metrics.json").read_text())
     for name in ("ekf", "live", "graph"):
         assert f"{metrics['accuracy'][name]['ate_rmse_m']:.3f}" in page.texts
-    assert "Tracks scatter by 0.53 px; the graph goes by 2.10 px, 1.00 told." in page.text
+    assert "Tracks scatter by 0.53 px; the graph uses 2.10 px, 1.00 given." in page.text
     assert "60 candidates: 12 accepted, 12 pending, 36 rejected." in page.text
     assert "scene <looks> alike, but 2.4 m apart" in page.texts  # escaped in the file, whole on the page
     assert "<looks>" not in text

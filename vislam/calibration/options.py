@@ -58,9 +58,9 @@ class CameraOptions:
     skew: bool = False
     """Estimate the skew s of K as well: 0 for nearly every sensor, not so for a film that was scanned aslant"""
     max_images: Count = 300
-    """So many images, evenly spaced, are searched for the board"""
+    """Images, evenly spaced, that are searched for the board"""
     max_views: Count = 40
-    """So many of those that show it, as different as possible, are used"""
+    """Images that show it and are used, as different as possible"""
     live_s: Positive = 60.0
     """How long a live camera is looked at; move the board slowly, hold it still now and then"""
     out: Path = Path("calibration")
@@ -141,7 +141,7 @@ class CameraImuOptions:
     """Recording as for `vislam run`: camera and IMU turn briskly to and fro about all axes before a textured scene"""
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     max_s: Positive = 120.0
-    """Only the first so many seconds"""
+    """Seconds from the beginning that are used"""
     out: Path = Path("calibration")
     """Folder for camera-imu.yaml (Kalibr's camchain), camera-imu.png and camera-imu.json"""
     overwrite: bool = False
@@ -159,7 +159,7 @@ class MagOptions:
     mode: Literal["auto", "2d", "3d"] = "auto"
     """2d: on the floor, level part only; 3d: by hand, to all sides; auto: by how far it was tilted"""
     imu: Path | None = None
-    """imu.yaml of `vislam calibrate imu`, for gravity and turns; None: what the recording itself says"""
+    """imu.yaml of `vislam calibrate imu`, for gravity and turns; None: the recording's own"""
     out: Path = Path("calibration")
     """Folder for mag.yaml, mag.png and mag.json"""
     overwrite: bool = False
@@ -194,9 +194,9 @@ class SelfOptions:
     """radtan5: k1 k2 p1 p2 k3; radtan: without k3, which Kalibr does not know; equidistant: lenses of over 100 degrees;
     auto: radtan5 or equidistant by the field of view"""
     max_s: Positive = 120.0
-    """Only the first so many seconds"""
+    """Seconds from the beginning that are used"""
     max_stretches: Count = 20
-    """So many stretches of some 20 keyframes, spread over the recording; more cost time and memory"""
+    """Stretches of some 20 keyframes, spread over the recording; more cost time and memory"""
     out: Path = Path("calibration")
     """Folder for camchain.yaml (Kalibr), self.png and self.json"""
     overwrite: bool = False

@@ -37,7 +37,7 @@ class Progress:
 
 
 class Watch(Protocol):
-    """One step: it takes what sensors say, tells how far it is, and calibrates in the end."""
+    """One step: it takes what sensors give, reports its progress, and calibrates in the end."""
 
     has_images: bool  # whether it takes frames, or else samples
 
@@ -46,7 +46,7 @@ class Watch(Protocol):
         ...
 
     def take(self, value: Value) -> None:
-        """Take what a sensor says; what does not concern the step is left."""
+        """Take what a sensor gives; what does not concern the step is left."""
         ...
 
     def progress(self) -> Progress:

@@ -33,9 +33,9 @@ _SAID = 400  # characters of what a program last said
 _METER = """
 import json, os, sys
 _, status, used = os.wait4(os.posix_spawnp(sys.argv[2], sys.argv[2:], os.environ), 0)
-told = {"code": os.waitstatus_to_exitcode(status), "cpu_s": used.ru_utime + used.ru_stime, "peak_kb": used.ru_maxrss}
+usage = {"code": os.waitstatus_to_exitcode(status), "cpu_s": used.ru_utime + used.ru_stime, "peak_kb": used.ru_maxrss}
 with open(sys.argv[1], "w") as file:
-    json.dump(told, file)
+    json.dump(usage, file)
 """
 
 
@@ -84,7 +84,7 @@ def run_command(
     for path in wanted:
         if path.is_file():
             split_stated(path, out / f"states_{path.stem.removeprefix('trajectory_')}.csv")
-    # those known in time come first: what is known in the end says nothing about when a pose was there
+    # those known in time come first: what is known in the end does not show when a pose was there
     begins_ns = [int(poses.t_ns[0]) for path in wanted if path.is_file() and len(poses := read_tum(path))]
     cost = {
         **per_frame(paid.cpu_s, len(t_ns), {}),
@@ -105,11 +105,11 @@ class _Paid(NamedTuple):
 
 def _run(command: list[str], work: Path) -> tuple[str, _Paid]:
     """Run a command to its end; return what went wrong, or nothing, and what it used, as Linux counts it."""
-    log, told = work / "said.txt", work / "used.json"
+    log, usage = work / "said.txt", work / "used.json"
     with log.open("wb") as said:
-        meter = [sys.executable, "-I", "-S", "-c", _METER, str(told), *command]
+        meter = [sys.executable, "-I", "-S", "-c", _METER, str(usage), *command]
         subprocess.run(meter, stdin=subprocess.DEVNULL, stdout=said, stderr=said, check=False)
-    used = json.loads(told.read_text(encoding="utf-8"))
+    used = json.loads(usage.read_text(encoding="utf-8"))
     paid = _Paid(used["cpu_s"], used["peak_kb"] / 1024.0)
     if used["code"] == 0:
         return "", paid

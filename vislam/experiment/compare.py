@@ -122,7 +122,7 @@ def write_results(
     failed = [job for job in unique(list(jobs)) if results.get(job.key, {}).get("status") == "failed"]
     lines = [f"{len(results)} results, {new} of them new, {len(failed)} failed"]
     lines += [f"failed: {job.label}: {results[job.key]['reason'].splitlines()[0]}" for job in failed[:10]]
-    lines += [winners.told(winner) for winner in overall]
+    lines += [winners.outcome(winner) for winner in overall]
     table = manifest["table_sha256"]
     lines += [f"table: {table}", f"report: {out / 'report.html'}"]
     data = {"out": str(out), "results": len(results), "new": new, "failed": len(failed), "table_sha256": table}

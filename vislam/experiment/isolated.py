@@ -46,7 +46,7 @@ def _supervise(spec: dict[str, Any], cache: str, folder: Path, stop: threading.E
     (folder / "request.json").write_text(json.dumps({"spec": spec, "cache": cache}), encoding="utf-8")
     with (folder / "said.txt").open("wb") as said:
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE,  # stays open: its end tells the worker that nobody waits any more
+            command, stdin=subprocess.PIPE,  # stays open: its end shows the worker that its parent is gone
             stdout=said, stderr=said, env={**os.environ, **threads},
             start_new_session=True,  # an interrupt is for the process that asked, which then ends this one
         )  # fmt: skip

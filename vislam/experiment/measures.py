@@ -62,7 +62,7 @@ def run_measures(metrics: dict[str, Any], latencies_s: Sequence[float]) -> dict[
 def output_measures(
     run: Path, outputs: Sequence[str], metrics: dict[str, Any], span_ns: tuple[int, int] | None
 ) -> dict[str, Any]:
-    """Return accuracy and consistency of each trajectory that a run left; one that cannot be judged says why."""
+    """Return accuracy and consistency of each trajectory that a run left; one that cannot be judged has the reason."""
     truth_file = run / "trajectory_truth.tum"
     truth = read_tum(truth_file) if truth_file.is_file() else None
     measures = {}

@@ -16,7 +16,7 @@ class CompareOptions:
     """Options of `vislam compare`."""
 
     plan: Positional[Path]
-    """TOML file that says what to compare on what; docs/experiments.md"""
+    """TOML file of what to compare on what; docs/experiments.md"""
     estimator: tuple[str, ...] = ()
     """More estimators for the plan: FILE.py, FILE.py:CLASS or MODULE:CLASS; docs/experiments.md, examples/09"""
     peer: tuple[str, ...] = ()

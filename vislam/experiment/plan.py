@@ -42,7 +42,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """One configuration of the pipeline, or a program of somebody else, and which of its trajectories are compared.
+    """One configuration of the pipeline, or a program by others, and which of its trajectories are compared.
 
     A program is a class (`program`, see `programs`) or a command line (`command`, see `commands`), which is known of
     some systems (`peer`, see `peers`).
@@ -119,7 +119,7 @@ def plan_text(path: Path, programs: Iterable[str] = (), known: Iterable[str] = (
         text += f"\n[[estimators]]\nname = {json.dumps(name)}\nprogram = {json.dumps(where + colon + cls)}\n"
     for asked in known:
         name, equals, python = asked.partition("=")
-        place = os.path.abspath(python) if "/" in python else python  # links stay: they are how an environment is told
+        place = os.path.abspath(python) if "/" in python else python  # links stay: an environment is known by them
         text += f"\n[[estimators]]\nname = {json.dumps(name)}\npeer = {json.dumps(name + equals + place)}\n"
     return text
 
@@ -183,7 +183,7 @@ def _placed(estimator: Estimator, where: str, folder: Path, variables: Mapping[s
 
 
 def _fitting(estimator: Estimator, sequences: Iterable[Sequence], where: str) -> Estimator:
-    """Return a peer, unless told otherwise, with the sequences that it can read; any other estimator as it is."""
+    """Return a peer with the sequences that it can read, unless the plan lists its own; any other estimator as it is."""
     if not estimator.peer or estimator.sequences:
         return estimator
     modes = ("auto", *peers.PEERS[estimator.peer.partition("=")[0]].modes)

@@ -198,7 +198,7 @@ class _Run:
             elif self._setup.imu_noise is not None:
                 self._asked(partial(self._estimator.inertial, value), f"inertial sample at {value.t_ns} ns")
         answer = self._asked(self._estimator.answer, "in the end")
-        self._final = self._told(answer)
+        self._final = self._final_of(answer)
 
     def write(self, out: Path) -> dict[str, Any]:
         """Write what is known; return the metrics, those of the pipeline that an estimator by others has, too."""
@@ -232,13 +232,13 @@ class _Run:
         self._cost.count(frame.t_ns, answered is not None)
 
     def _asked(self, ask: Callable[[], Any], where: str) -> Any:
-        """Return what an estimator answers; whatever it raises is told with its name and place."""
+        """Return what an estimator answers; whatever it raises is reported with its name and place."""
         try:
             return ask()
         except Exception as error:
             raise ProgramError(f"{self._program}: {where}: {type(error).__name__}: {error}") from error
 
-    def _told(self, answer: Any) -> Trajectory:
+    def _final_of(self, answer: Any) -> Trajectory:
         """Return the trajectory of an answer, and keep the covariances that came with it."""
         given = None
         if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Trajectory):

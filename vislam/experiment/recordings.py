@@ -68,7 +68,7 @@ def _rendered(source: str, seed: int, cache: Path) -> Path:
 class TimedRecording(WrappedRecording):
     """A recording that notes how long its consumer was busy with each frame.
 
-    A frame is finished by the inertial sample after it, so `frame_done` tells when, and the whole time since the
+    A frame is finished by the inertial sample after it, so `frame_done` states when, and the whole time since the
     consumer took that value counts.
 
     Attributes:

@@ -24,7 +24,7 @@ _GRACE_S = 30.0  # that a result may take through the cluster's file system once
 _ANSWER_S = 60.0
 _MARGIN_MIN = 5  # of a task's time beyond its job's
 _SAID = 400  # characters of what a task last said
-_LARGEST = 1000  # array that clusters take, unless they were told otherwise
+_LARGEST = 1000  # array that clusters take, unless they are configured otherwise
 
 Finished = Generator[tuple[dict[str, Any], dict[str, Any]], None, None]
 

@@ -1,4 +1,4 @@
-"""How sure an estimator by others says its poses are: optional columns of its file, optional parts of its answers.
+"""How sure an estimator by others states its poses to be: optional columns of its file, optional parts of its answers.
 
 A covariance [6, 6] is of (rotation [rad], position [m]): rotation perturbed on the body side, position in the axes of
 its own world, as `NavState` has it. It goes through the same statistics as that of our states.

@@ -14,7 +14,7 @@ from vislam.experiment.plan import Scalar
 from vislam.experiment.trials import BY_NAME, CAUSAL, Trial
 
 _PERCENTILES = (5.0, 95.0)
-_MIN_FOR_PERCENTILES = 20  # with fewer trials, percentiles are made up: the range is told as it is
+_MIN_FOR_PERCENTILES = 20  # with fewer trials, percentiles are made up: the range is reported as it is
 
 Variant = tuple[tuple[str, Scalar], ...]
 
@@ -52,7 +52,7 @@ class Group:
     def spread(self, metric: str) -> Spread | None:
         """Return the spread of a metric; None when no trial measured it.
 
-        A failed trial counts as an infinite error; what is no error (time, memory, scale) is told of the others only.
+        A failed trial counts as an infinite error; what is no error (time, memory, scale) counts of the others only.
         """
         is_error = metric in BY_NAME and BY_NAME[metric].kind == "error"
         values = [trial.values[metric] for trial in self.trials if not trial.failure and metric in trial.values]

@@ -11,7 +11,7 @@ from vislam.experiment.identity import sha256_of
 from vislam.experiment.jobs import Job
 from vislam.experiment.plan import Plan
 
-_MIN_COMPLETE = 0.5  # of the recording's time; below, a small error only says that little was estimated
+_MIN_COMPLETE = 0.5  # of the recording's time; below, a small error only means that little was estimated
 CAUSAL = ("ekf", "live", "causal")  # known when the frame came; the others know the whole recording
 OUTPUT_TITLES = {
     "ekf": "filter, causal", "live": "graph, causal", "causal": "causal",
@@ -54,7 +54,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("anees_rotation", "ANEES rotation", "ratio", 2),
     Metric("anees_velocity", "ANEES velocity", "ratio", 2),
     Metric("initialisation_s", "initialised after [s]", "cost", 2),
-    Metric("doubts", "doubts told", "count", 0),
+    Metric("doubts", "doubts reported", "count", 0),
     Metric("latency_p50_ms", "frame p50 [ms]", "cost", 1),
     Metric("latency_p99_ms", "frame p99 [ms]", "cost", 1),
     Metric("filter_p50_ms", "filter p50 [ms]", "cost", 2),
@@ -112,11 +112,11 @@ def trials(plan: Plan, jobs: Sequence[Job], results: Mapping[str, dict[str, Any]
 
 
 def table_sha256(found: Sequence[Trial]) -> str:
-    """Return the SHA-256 of all that a plan's results say, whoever computed them, in whatever order.
+    """Return the SHA-256 of all that a plan's results state, wherever they were computed, in whatever order.
 
     Every trajectory counts by its own SHA-256, and every number but what time and memory were used: those are never
     twice the same. Nor do errors from the start count, which came later and follow from the trajectory: tables from
-    before them are still to be told.
+    before them are still to be recognised.
     """
     timed = {metric.name for metric in METRICS if metric.kind == "cost"} | {*FROM_START}
     rows = [

@@ -1,4 +1,4 @@
-"""Whether the numbers of a comparison come out again: jobs are run anew and held against its manifest."""
+"""Whether the numbers of a comparison come out again: jobs are run again and held against its manifest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vislam.experiment.trials import Trial, trials
 Outcome = Literal["identical", "within the spread", "differs"]
 Rerun = Callable[[Sequence[Job]], dict[str, dict[str, Any]]]  # from jobs to results by key, without the store
 
-_FLOOR_M = 1e-6  # ensembles may agree to the last bit; a micrometre is nobody's difference
+_FLOOR_M = 1e-6  # ensembles may agree to the last bit; a micrometre makes no difference
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +77,8 @@ def _judge(trial: Trial, recorded: dict[tuple[str, str], dict[str, Any]]) -> Ver
     before = recorded[trial.job.label, trial.output]
     name = (trial.job.label, trial.output)
     if bool(trial.failure) != bool(before["failure"]):
-        told = f"failed now: {trial.failure}" if trial.failure else f"failed then: {before['failure']}"
-        return Verdict(*name, "differs", told)
+        outcome = f"failed now: {trial.failure}" if trial.failure else f"failed then: {before['failure']}"
+        return Verdict(*name, "differs", outcome)
     if trial.failure:
         return Verdict(*name, "identical", "failed then and now")
     if trial.sha256 == before["sha256"]:
@@ -91,8 +91,8 @@ def _judge(trial: Trial, recorded: dict[tuple[str, str], dict[str, Any]]) -> Ver
     now, then = trial.values["ate_m"], before["ate_m"]
     low, high = min(ensemble), max(ensemble)
     slack = high - low + _FLOOR_M
-    told = f"ATE {now:.6f} m, then {then:.6f} m, ensemble {low:.6f} to {high:.6f} m"
-    return Verdict(*name, "within the spread" if low - slack <= now <= high + slack else "differs", told)
+    outcome = f"ATE {now:.6f} m, then {then:.6f} m, ensemble {low:.6f} to {high:.6f} m"
+    return Verdict(*name, "within the spread" if low - slack <= now <= high + slack else "differs", outcome)
 
 
 def _remarks(manifest: dict[str, Any]) -> list[str]:

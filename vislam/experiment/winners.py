@@ -71,7 +71,7 @@ def of_sequences(groups: Sequence[Group], metric: str) -> list[Winner]:
     return found
 
 
-def told(winner: Winner) -> str:
+def outcome(winner: Winner) -> str:
     """Return the outcome in one line."""
     head = f"{BY_NAME[winner.metric].title.partition(' [')[0]}, {winner.kind}: "
     if not winner.estimate:
@@ -134,4 +134,6 @@ def _why_none(tests: Sequence[Comparison]) -> str:
     closest = max((c for c in tests if not _better(c)), key=lambda c: c.p_holm, default=None)
     if closest is None:
         return "each is beaten by another one"
-    return f"{closest.first} and {closest.second} cannot be told apart (p {closest.p_holm:.2f}, {closest.pairs} pairs)"
+    return (
+        f"{closest.first} and {closest.second} cannot be distinguished (p {closest.p_holm:.2f}, {closest.pairs} pairs)"
+    )

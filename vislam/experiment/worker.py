@@ -1,7 +1,6 @@
 """One job in a process of its own: `python -m vislam.experiment.worker FOLDER`, from request.json to result.json.
 
-Standard input is a pipe that nothing is written to: when it closes, the process that asked is gone, and there is nobody
-left to work for.
+Standard input is a pipe that nothing is written to: when it closes, the parent is gone, and nothing is left to work for.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _MAX_TRACE = 4000  # characters of a traceback that are kept
 
 
 def run_job(spec: dict[str, Any], folder: Path, cache: Path) -> dict[str, Any]:
-    """Run the pipeline as `spec` says (see `Job.spec`) into `folder`/run and return the result as plain data.
+    """Run the pipeline by `spec` (see `Job.spec`) into `folder`/run and return the result as plain data.
 
     Whatever goes wrong is a result too: status "failed" with a reason, beside what could be measured. Status
     "mismatch": this machine has other code or packages than the one that asked.
@@ -80,7 +79,7 @@ def _batch(spec: dict[str, Any], config: Config, out: Path, result: dict[str, An
 
     try:
         optimize(out, config.batch)
-    except VislamError as error:  # the other trajectories stay; this one is missing, and that is told
+    except VislamError as error:  # the other trajectories stay; this one is missing, and that is reported
         result["batch_failure"] = str(error)
     return ["batch"]
 

@@ -1,6 +1,6 @@
 """One recording through the pipeline into a run folder: the library's side of `vislam run`.
 
-`begin` starts or resumes a run, `drive` feeds the pipeline and keeps the folder, `metrics` says what came out, `show`
+`begin` starts or resumes a run, `drive` feeds the pipeline and keeps the folder, `metrics` sums up the results, `show`
 what the viewer is shown.
 """
 

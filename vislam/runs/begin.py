@@ -1,4 +1,4 @@
-"""How a run begins: anew, in the map of another session, or where it was killed or interrupted."""
+"""How a run begins: from nothing, in the map of another session, or where it was killed or interrupted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vislam.runs.folder import MapChoice, storage, write_setup
 from vislam.runs.levelled import stored_level
 from vislam.runs.session import Session, SessionWriter, has_begun, recall
 
-_FARTHEST_M = 1e5  # of a pose that somebody gives
+_FARTHEST_M = 1e5  # of a pose that a user gives
 # settings (map.*) that decide what a keyframe's cloud is; what is made of clouds may be set otherwise in every run
 _SHAPING = (
     "min_range_m", "max_range_m", "pixel_step", "edge_ratio", "edge_px", "speckle_pixels", "stereo_scale",

@@ -1,4 +1,4 @@
-"""What a run costs whoever runs it: CPU, memory, and the way to the first pose; compilation stands apart."""
+"""What a run costs: CPU, memory, and the way to the first pose; compilation stands apart."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def whole_cost(metrics: Mapping[str, Any], notes: Mapping[str, Mapping[str, Any]
 
     Memory is the sum of what each had at most; pages that they share count in each.
     """
-    each = {role: told["cost"] for role, told in notes.items() if "cost" in told}
+    each = {role: values["cost"] for role, values in notes.items() if "cost" in values}
     sums = {name: sum(cost[name] for cost in each.values()) for name in ("cpu_s", "compile_cpu_s", "peak_memory_mb")}
     stages_s = {name: stage["cpu_s"] for name, stage in metrics["timing_ms"].items()}
     spent = per_frame(sums["cpu_s"], metrics["frames"], stages_s)

@@ -56,7 +56,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def imu_noise(config: ImuConfig, recorded: ImuNoise | None) -> ImuNoise | None:
-    """Return the recording's noise model with what the configuration says of it; None without an IMU or with it off."""
+    """Return the recording's noise model with what is configured of it; None without an IMU or with it off."""
     if recorded is None or not config.enabled:
         return None
     overrides = {name: value for name in asdict(recorded) if (value := getattr(config, name, None)) is not None}
@@ -300,7 +300,7 @@ class Run:
         return final, rows, loops
 
     def _explain(self, rows: list[LoopRow]) -> None:
-        """Write the pictures of telling loop candidates, and show all as they were decided in the end."""
+        """Write the pictures of the loop candidates worth seeing, and show all as they were decided in the end."""
         for row, path in self.gallery.write(self.out, rows):
             self.viewer.log_loop_picture(row.to_t_ns, path.read_bytes(), caption(row))
         decided = {(row.from_id, row.to_id): LoopDecision(row.decision) for row in rows}  # the last word counts
@@ -386,7 +386,8 @@ class Run:
         if self.base is None:
             return None
         if self.joined_t_ns is None:
-            self.warnings.append(f"the recording was not found in the map {self.base['path']}: its poses begin anew")
+            where = self.base["path"]
+            self.warnings.append(f"the recording was not found in the map {where}: its poses begin at a new origin")
             return {**self.base, "found_t_s": None}
         return {**self.base, "found_t_s": (self.joined_t_ns - int(self.log.stamps_ns[0])) * 1e-9}
 

@@ -21,7 +21,7 @@ from vislam.runs.verdict import Apart, Evidence, Moved, TurnStep, force_agreemen
 from vislam.trajectory import Trajectory, align, associate
 
 _MIN_COMPARED = 10  # poses
-_SAMPLES = 4  # of a span, at least, that says something
+_SAMPLES = 4  # of a span, at least, for a judgement
 _REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
 _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
 
@@ -68,15 +68,15 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         max_gap_s=machine.max_gap_s,
         **_calibration(report.calibration),
     )
-    condition, noise, told = report.condition, report.noise_ratios, report.told_noise
-    if condition is None or told is None:
+    condition, noise, given = report.condition, report.noise_ratios, report.told_noise
+    if condition is None or given is None:
         return evidence
     return replace(
         evidence,
-        gyro_noise=None if noise is None else noise.gyro_quiet * told.gyroscope_noise_density,
-        accel_noise=None if noise is None else noise.accel_quiet * told.accelerometer_noise_density,
+        gyro_noise=None if noise is None else noise.gyro_quiet * given.gyroscope_noise_density,
+        accel_noise=None if noise is None else noise.accel_quiet * given.accelerometer_noise_density,
         rate_hz=condition.rate_hz if np.isfinite(condition.rate_hz) else None,
-        rate_told_hz=told.rate_hz,
+        rate_told_hz=given.rate_hz,
         longest_gap_s=condition.longest_gap_s,
         saturated=condition.saturated_axes,
         force_m_s2=condition.force_m_s2 if np.isfinite(condition.force_m_s2) else None,

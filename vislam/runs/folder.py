@@ -95,14 +95,14 @@ def _files_of_run(out: Path) -> list[Path]:
         "session.db.part", ".*.partial", "map/.*.partial", "loops/.*.partial",
     )  # fmt: skip
     found = {path for pattern in patterns for path in out.glob(pattern)}
-    # what says that it is a run comes last: removing them may be interrupted
+    # what marks it as a run comes last: removing them may be interrupted
     return sorted(found, key=lambda path: (path.name in ("manifest.json", FILE_NAME), path))
 
 
 def _holds_nothing(out: Path, files: list[Path]) -> bool:
     """Return whether a folder is that of a run that ended before its first frame, as where a sensor was missing.
 
-    It may be replaced without asking: a run begins with its log, and nobody else's file is there.
+    It may be replaced without asking: a run begins with its log, and no foreign file is there.
     """
     if not out.is_dir() or not (out / FILE_NAME).is_file() or has_frames(out / "session.db"):
         return False
@@ -122,14 +122,14 @@ def read_setup(out: Path) -> tuple[str, Config, MapChoice | None]:
     manifest, settings = (_read_json(out / name) for name in ("manifest.json", "config.json"))
     source = manifest.get("source")
     if not isinstance(source, str):
-        raise UsageError(f"{out / 'manifest.json'} names no source; start the run anew with --overwrite")
+        raise UsageError(f"{out / 'manifest.json'} names no source; start the run again with --overwrite")
     if _fingerprint_of(source) != manifest.get("data_sha256"):
         raise DataError(f"{source} is not the recording that {out} began with; start a new run")
     base = manifest.get("map")
     try:
         choice = None if base is None else MapChoice(Path(base["path"]), bool(base["localize_only"]))
     except (KeyError, TypeError) as error:
-        raise DataError(f"{out / 'manifest.json'} names no sound map; start the run anew with --overwrite") from error
+        raise DataError(f"{out / 'manifest.json'} names no sound map; start the run again with --overwrite") from error
     where = str(out / "config.json")
     return source, from_data(recorded(settings, where), where), choice
 
@@ -144,9 +144,9 @@ def _read_json(path: Path) -> dict[str, Any]:
             "with --overwrite if the folder exists"
         ) from error
     except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read: {error}; start the run anew with --overwrite") from error
+        raise DataError(f"{path} cannot be read: {error}; start the run again with --overwrite") from error
     if not isinstance(data, dict):
-        raise DataError(f"{path} holds no object; start the run anew with --overwrite")
+        raise DataError(f"{path} holds no object; start the run again with --overwrite")
     return data
 
 

@@ -25,14 +25,14 @@ _EDGE_NS = 100_000_000  # of a truth, at which its rates are not known well
 
 
 def suite_of(config: FurtherSensorsConfig) -> Suite | None:
-    """Return the sensors that a run is told; None without any. Raises UsageError as `load_sensor_setup`."""
+    """Return the further sensors of a run; None without any. Raises UsageError as `load_sensor_setup`."""
     return None if config.file is None else load_sensor_setup(Path(config.file)).suite
 
 
 def further_readings(recording: Recording, config: FurtherSensorsConfig, seed: int) -> FurtherReadings | None:
-    """Return the readings of the sensors that a run is told; None without any.
+    """Return the readings of a run's further sensors; None without any.
 
-    Raises UsageError for settings that cannot be, DataError when readings shall be drawn and nobody knows the truth.
+    Raises UsageError for settings that cannot be, DataError when readings are to be drawn without a truth.
     """
     return None if config.file is None else FurtherReadings(recording, load_sensor_setup(Path(config.file)), seed)
 
@@ -46,7 +46,7 @@ class FurtherReadings:
     """
 
     def __init__(self, recording: Recording, setup: SensorSetup, seed: int) -> None:
-        """Prepare to read the files of a setup, and to draw what it says is simulated; see `drawn`.
+        """Prepare to read the files of a setup, and to draw what it has as simulated; see `drawn`.
 
         Raises UsageError for a sensor that has neither.
         """

@@ -32,7 +32,7 @@ _DIGITS, _HEIGHT_DIGITS = 9, 4  # of degrees, 0.1 mm, and of metres
 
 
 def datums_of(config: FurtherSensorsConfig) -> dict[str, Geodetic]:
-    """Return, by sensor, the datum of its frame: as told, or of the first good fix in the file of a receiver.
+    """Return, by sensor, the datum of its frame: as given, or of the first good fix in the file of a receiver.
 
     Raises UsageError as `load_sensor_setup`.
     """
@@ -44,7 +44,7 @@ def datums_of(config: FurtherSensorsConfig) -> dict[str, Geodetic]:
         if name not in datums and file.format != "csv":
             try:
                 datums[name] = local_frame(file).datum
-            except DataError:  # no good fix: whoever reads the file says so
+            except DataError:  # no good fix: reading the file reports it
                 continue
     return datums
 
@@ -63,13 +63,13 @@ class GeodeticOutputs:
 
         Args:
             out: the folder of the run; where it has states with covariances, the tables have sigmas.
-            sensors: what `metrics.json` has of further sensors; their datum is added. A receiver at a port has told
+            sensors: what `metrics.json` has of further sensors; their datum is added. A receiver at a port has reported
                 its own there.
             trajectories: of the filter in `odom` and of the graph in `map`, by "filter" and "graph".
         """
-        told = {name: Geodetic(**entry["datum"]) for name, entry in sensors.items() if "datum" in entry}
+        reported = {name: Geodetic(**entry["datum"]) for name, entry in sensors.items() if "datum" in entry}
         used = None
-        for name, datum in {**self._datums, **told}.items():
+        for name, datum in {**self._datums, **reported}.items():
             if (entry := sensors.get(name)) is None:
                 continue
             entry["datum"] = asdict(datum)
@@ -157,17 +157,17 @@ def _write(
     sigmas: Mapping[str, Array | None],
 ) -> None:
     for by, trajectory in trajectories.items():
-        rows = [(t_ns, *_told(place)) for t_ns, place in zip(trajectory.t_ns.tolist(), places[by], strict=True)]
+        rows = [(t_ns, *_text(place)) for t_ns, place in zip(trajectory.t_ns.tolist(), places[by], strict=True)]
         if (most := sigmas[by]) is None:
             table = csv_text(COLUMNS, rows)
         else:
-            told = [[f"{sigma:.{_HEIGHT_DIGITS}f}" for sigma in row] for row in most.tolist()]
-            table = csv_text(COLUMNS + SIGMA_COLUMNS, [(*row, *of) for row, of in zip(rows, told, strict=True)])
+            sigmas = [[f"{sigma:.{_HEIGHT_DIGITS}f}" for sigma in row] for row in most.tolist()]
+            table = csv_text(COLUMNS + SIGMA_COLUMNS, [(*row, *of) for row, of in zip(rows, sigmas, strict=True)])
         write_text(out / TABLES[by], table)
     write_text(out / LINES, json.dumps(lines_on_a_map(places)) + "\n")
 
 
-def _told(place: Geodetic) -> tuple[str, str, str]:
+def _text(place: Geodetic) -> tuple[str, str, str]:
     latitude, longitude = (f"{angle:.{_DIGITS}f}" for angle in (place.latitude_deg, place.longitude_deg))
     return latitude, longitude, f"{place.height_m:.{_HEIGHT_DIGITS}f}"
 

@@ -40,7 +40,7 @@ class Levelled:
 
     Attributes:
         up: None where gravity is known.
-        asked: what each of those says who were asked; surfaces are the last.
+        asked: what each source gives that was asked; surfaces are the last.
     """
 
     up: Up | None = None
@@ -83,8 +83,8 @@ class Levelled:
 
     @property
     def _apart_deg(self) -> float | None:
-        """By how much surfaces differ from who was believed before them."""
-        *others, planes = self.asked or (Up.unknown("nobody was asked"),)
+        """By how much surfaces differ from the source that was believed before them."""
+        *others, planes = self.asked or (Up.unknown("no source was asked"),)
         first = next((up.direction for up in others if up.direction is not None), None)
         return None if first is None or planes.direction is None else angle_deg(first, planes.direction)
 
@@ -100,9 +100,9 @@ class Levelled:
         if self.up.direction is not None and len(path):
             R_map_cam = path.T_world_body[0, :3, :3] @ rig.T_body_cams[0][:3, :3]
             direction = (R_map_cam.T @ self.up.direction).tolist()
-        told = {**self.up.entry(), "direction_cam0": direction, "R_map_odom": self.T_level_map[:3, :3].tolist()}
+        entry = {**self.up.entry(), "direction_cam0": direction, "R_map_odom": self.T_level_map[:3, :3].tolist()}
         asked = {up.source: up.entry() for up in self.asked if up.is_known}
-        return {"up": {**told, "from_planes_deg": self._apart_deg, "asked": asked}}
+        return {"up": {**entry, "from_planes_deg": self._apart_deg, "asked": asked}}
 
     def trajectory(self, path: Trajectory) -> Trajectory:
         """Return a trajectory in the level frame."""
@@ -143,16 +143,16 @@ class Known:
 
 
 def find_up(recording: Recording, config: Config, known: Known) -> Levelled:
-    """Return which way is up, without gravity: as told, by the map, the accelerometer, the floor, or surfaces."""
-    told = parse_up(config.up)
+    """Return which way is up, without gravity: as given, by the map, the accelerometer, the floor, or surfaces."""
+    asked = parse_up(config.up)
     if known.front.start is not None or not len(known.path):
         return Levelled()
-    if not isinstance(told, str):
-        up = known.path.T_world_body[0, :3, :3] @ recording.rig.T_body_cams[0][:3, :3] @ told
+    if not isinstance(asked, str):
+        up = known.path.T_world_body[0, :3, :3] @ recording.rig.T_body_cams[0][:3, :3] @ asked
         return Levelled(Up("told", up / np.linalg.norm(up), None, 1.0, f"--up {config.up}"))
-    if told == "none":
+    if asked == "none":
         return Levelled(Up.unknown("--up none"))
-    if told == "camera":
+    if asked == "camera":
         return Levelled(Up("camera", np.array([0.0, 0.0, 1.0]), None, 1.0, "--up camera: as the first image has it"))
     of_map = stored_up({"up": known.of_map})
     return _found(recording, known) if of_map is None else Levelled(replace(of_map, source="map"))
@@ -172,7 +172,7 @@ def _found(recording: Recording, known: Known) -> Levelled:
 def with_planes(first: Up, planes: Up) -> Up:
     """Return both as one, weighted by their sigmas, where they agree; the first alone where they do not.
 
-    Sigma is that of the surer one: both go by one trajectory, so their errors are not independent.
+    Sigma is that of the surer one: both use one trajectory, so their errors are not independent.
     """
     if first.direction is None or planes.direction is None or not first.sigma_deg or not planes.sigma_deg:
         return first
@@ -191,7 +191,7 @@ def _together_deg(ups: Sequence[Up]) -> float:
 
 
 def up_sentence(entry: dict[str, Any]) -> str:
-    """Return in words what the entry `up` of metrics.json says; without a full stop."""
+    """Return the entry `up` of metrics.json in words; without a full stop."""
     reason = str(entry.get("reason", ""))
     if entry.get("direction") is None:
         return f"Which way is up is not known, and no grid is written: {reason}"
@@ -231,22 +231,22 @@ def stored_level(info: dict[str, Any]) -> Levelled:
 
 
 def _by_forces(recording: Recording, path: Trajectory) -> Up | None:
-    """Return what an accelerometer without a gyroscope says, None where there is none."""
+    """Return what an accelerometer without a gyroscope shows, None where there is none."""
     if not isinstance(recording, FileRecording):
         return None
     try:
         samples = recording.forces()
     except DataError as error:
-        return Up.unknown(f"the accelerometer does not tell: {error}")
+        return Up.unknown(f"the accelerometer does not show it: {error}")
     return None if samples is None else up_of_forces(path, *samples)
 
 
 def _by_floor(known: Known, rig: Rig) -> Up | None:
-    """Return the floor's normal where odometry goes by a floor, None elsewhere."""
+    """Return the floor's normal where odometry uses a floor, None elsewhere."""
     mount = known.front.report().calibration
     if mount.get("tilt_deg") is None or mount.get("roll_deg") is None:
         return None
     tilt, roll = np.deg2rad([mount["tilt_deg"], mount["roll_deg"]])
     up_body = rig.T_body_cams[0][:3, :3] @ up_in_camera(tilt, roll)
     up = np.mean(known.path.T_world_body[:, :3, :3] @ up_body, axis=0)
-    return Up("floor", up / np.linalg.norm(up), None, 1.0, "the normal of the floor that odometry goes by")
+    return Up("floor", up / np.linalg.norm(up), None, 1.0, "the normal of the floor that odometry uses")

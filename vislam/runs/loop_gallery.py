@@ -29,7 +29,7 @@ _COLORS = {"accepted": (90, 190, 60), "pending": (60, 180, 230), "rejected": (70
 
 
 class LoopGallery:
-    """Keeps thumbnails while a run goes on, and writes the most telling pairs when all is decided."""
+    """Keeps thumbnails while a run goes on, and writes the pairs most worth seeing when all is decided."""
 
     def __init__(self) -> None:
         """Start empty."""
@@ -111,7 +111,7 @@ def chosen(rows: Sequence[LoopRow], known: Sequence[int]) -> list[int]:
 
     accepted = sorted((k for k in known if rows[k].decision == LoopDecision.ACCEPTED), key=moved)
     others = sorted((k for k in known if rows[k].decision != LoopDecision.ACCEPTED), key=close)
-    taken = {(rows[k].from_id, rows[k].to_id) for k in accepted}  # pending first, accepted later: is told there
+    taken = {(rows[k].from_id, rows[k].to_id) for k in accepted}  # pending first, accepted later: is shown there
     reasons: Counter[str] = Counter()
     shown: list[int] = []
     for k in others:

@@ -13,7 +13,7 @@ from vislam.runs.pipeline import FinalGraph
 from vislam.runs.verdict import Evidence, Verdict
 from vislam.trajectory import Alignment, Trajectory, evaluate
 
-_BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that neither filter nor graph was told
+_BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that reached neither filter nor graph
 _BY_FILTER = ("accepted", "gated", "refused", "waiting", "failed")
 _BY_GRAPH = ("used", "in_window", "thinned", "early")
 _NOT_IN_GRAPH = ("late", "unplaced", "crowded")
@@ -83,14 +83,14 @@ def verdict_entry(evidence: Evidence, verdict: Verdict) -> dict[str, Any]:
 
 
 def sensors_entry(
-    told: dict[str, dict[str, Any]], counters: dict[str, dict[str, int]], graph: FinalGraph | None
+    reported: dict[str, dict[str, Any]], counters: dict[str, dict[str, int]], graph: FinalGraph | None
 ) -> dict[str, dict[str, Any]]:
-    """Return what is known of further sensors, `told` by the front half, with their own variables in the graph.
+    """Return what is known of further sensors, `reported` by the front half, with their own variables in the graph.
 
     And what became of their readings: all that came, and where each is in the filter and in the graph.
     """
     out = {}
-    for name, entry in with_own_of_graph(told, graph).items():
+    for name, entry in with_own_of_graph(reported, graph).items():
         queued, since = int(entry.get("queued", 0)), int(entry.get("since_keyframe", 0))
         came = counters.get(f"sensor {name}", {})
         both = {end: came.get(end, 0) for end in _BEFORE} | {"queued": queued}
@@ -123,7 +123,7 @@ def _in_filter(name: str, came: dict[str, int], ekf: dict[str, int]) -> dict[str
 
 
 def _slipped(came: dict[str, int]) -> dict[str, int]:
-    """Return how many readings of wheels that slip the graph was not told; empty where none did."""
+    """Return how many readings of wheels that slip were kept from the graph; empty where none did."""
     slipped = came.get("slipped", 0) + came.get("slip_began", 0)
     return {"slipped": slipped} if slipped else {}
 

@@ -88,7 +88,7 @@ def record(
     progress: Callable[[Recorded], None] | None = None,
     further: FurtherPorts | None = None,
 ) -> Recorded:
-    """Record until told to stop, for some seconds, to the end of a video, or until the disk budget is used up.
+    """Record until a stop, for some seconds, to the end of a video, or until the disk budget is used up.
 
     Args:
         out: folder to make.
@@ -100,7 +100,7 @@ def record(
         seconds: length, None: until stopped.
         in_real_time: of a video; otherwise as fast as it is written.
         stop: ends the recording when set, as a first signal does (`interrupts.SIGNALS`) once it is going.
-        progress: is told how it stands once a second.
+        progress: is called with the state once a second.
         further: sensors at ports, whose readings are written beside the recording.
 
     Raises:
@@ -218,7 +218,7 @@ class _Recording:
                 recorded.notes += self._readings.notes()
         except StorageError as error:
             recorded.ended = str(error)
-            with suppress(StorageError, OSError):  # what went wrong first is what is told
+            with suppress(StorageError, OSError):  # what went wrong first is what is reported
                 self._take_stock()
                 self._describe()
             raise

@@ -25,7 +25,7 @@ from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.toml import SensorPort, SensorSetup, load_sensor_setup
 
 FILE_NAME = "sensors.toml"
-# what says how a device is read; a table of readings is read otherwise
+# keys of how a device is read; a table of readings is read otherwise
 _OF_PORTS = (
     "port", "baud", "delay_s", "format", "ticks", "file", "offset_s", "topic", "joints", "simulated_hz",
     "simulated_slips",
@@ -40,7 +40,7 @@ class PortReader(Protocol):
         ...
 
     def status(self) -> dict[str, str]:
-        """Return by sensor "well", or what ails it."""
+        """Return by sensor "well", or its problem."""
         ...
 
     def counters(self) -> dict[str, dict[str, int]]:
@@ -48,7 +48,7 @@ class PortReader(Protocol):
         ...
 
     def datums(self) -> dict[str, Geodetic]:
-        """Return by receiver where its frame begins, as far as it has told."""
+        """Return by receiver where its frame begins, as far as it has reported."""
         ...
 
     def close(self) -> None:
@@ -147,8 +147,8 @@ class ReadingRecorder:
             return ()
         status = self._reader.status()
         silent = [f"[sensors.{name}] gave no reading: {status[name]}" for name in status if not self._written[name]]
-        told = f"further sensors: vislam run {self._folder} --sensors.file {self._folder / FILE_NAME}"
-        return (told, *silent)
+        use = f"further sensors: vislam run {self._folder} --sensors.file {self._folder / FILE_NAME}"
+        return (use, *silent)
 
     def close(self) -> None:
         """Close the ports; may be called twice."""
@@ -159,14 +159,14 @@ class ReadingRecorder:
 
     def _header(self, name: str) -> str:
         port, sensor = self._asked.setup.ports[name], self._asked.setup.sensors[name]
-        sigmas = () if port.format == "csv" else sensor.sigma_columns  # receivers tell how sure each fix is
+        sigmas = () if port.format == "csv" else sensor.sigma_columns  # receivers state how sure each fix is
         return ",".join(("t_ns", *sensor.columns, *sigmas))
 
     def _describe(self) -> None:
         """Write the sensors' tables with files in the place of their ports."""
         lines = ["# Written by vislam record; readings are by the clock of the IMU, delays taken off."]
-        for name, told in self._asked.tables.items():
-            table = dict(told)
+        for name, given in self._asked.tables.items():
+            table = dict(given)
             lines.append(f"\n[sensors.{name}]")
             if name in self._asked.setup.ports:
                 if "ticks" in table:

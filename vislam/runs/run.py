@@ -78,7 +78,7 @@ def written_up(out: Path, command: Sequence[str], is_hurried: Callable[[], bool]
         try:
             yield
         except KeyboardInterrupt:
-            raise  # whoever interrupts does not wait for a report
+            raise  # an interrupt does not wait for a report
         except BaseException:
             with suppress(VislamError):  # what went wrong first is what is reported
                 if (out / "metrics.json").is_file():

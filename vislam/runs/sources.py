@@ -34,7 +34,7 @@ def open_source(uri: str, seed: int = 0, calibration: CalibrationConfig | None =
     Vision simulated as points, on a world's motion or on the real IMU of a recording with truth: `points:WORLD` or
     `points:PATH`. Real tracks without images: `eqvio:FILE`, or `eqvio:gtsam` for the table that GTSAM's package brings.
     To bags and to all that are not on disk options are appended as `,option=value`. Calibration files that are named
-    take the place of what a recording on disk says itself.
+    take the place of a recording's own.
 
     Raises UsageError for an unknown format, world or option, or for calibration files of a source that takes none;
     DataError when the recording cannot be used.
@@ -113,7 +113,7 @@ def measured_inertial(uri: str) -> MeasuredInertial:
 
 
 def without_idle_cameras(recording: Recording, config: Config) -> Recording:
-    """Return a recording that reads cam0 alone where nobody looks at the others: mono, and without a map."""
+    """Return a recording that reads cam0 alone where the others are not used: mono, and without a map."""
     from vislam.datasets.stream import FileRecording
     from vislam.frontend import knows_scale, mode_for
 

@@ -76,7 +76,7 @@ class Board:
         return np.asarray(255 * ((column + row) % 2), dtype=np.uint8)
 
     def find(self, image: ImageU8, name: str) -> View | None:
-        """Return the board's points in a grey image [H, W], None where too few of them are seen to tell its pose."""
+        """Return the board's points in a grey image [H, W], None where too few of them are seen for its pose."""
         points, pixels = self._charuco_points(image) if self.kind == "charuco" else self._chessboard_points(image)
         if len(points) < _MIN_POINTS:
             return None

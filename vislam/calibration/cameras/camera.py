@@ -60,7 +60,7 @@ def calibrate_camera(options: CameraOptions) -> Outcome:
 
 
 def solve_camera(found: Found, options: CameraOptions) -> CameraResult:
-    """Return the camera; raises DataError that says which views lack."""
+    """Return the camera; raises DataError that names the views that lack."""
     views = choose(found.views, found.size, options.max_views)
     what = f"the camera in {options.source}"
     if len(views) < _MIN_VIEWS:

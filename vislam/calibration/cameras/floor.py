@@ -1,7 +1,7 @@
 """`vislam calibrate floor`: how a cart's camera is tilted against the floor, and how high it is above it.
 
 The floor's flow shows the tilt, whatever the height: points that pass near and far have to move as one plane does. The
-height is pure scale: only a way that was measured, or a tape, tells it.
+height is pure scale: only a measured way, or a tape, gives it.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def calibrate_floor(options: FloorOptions) -> Outcome:
     """Find height and tilt of the camera and write them; raises DataError where the drive does not determine them."""
     if (options.distance_m is None) == (options.height_m is None):
         raise UsageError(
-            "the floor's flow cannot tell the height: give --distance-m of a measured drive, or --height-m by tape"
+            "the floor's flow does not show the height: give --distance-m of a measured drive, or --height-m by tape"
         )
     folder = Folder(options.out, _FILES, options.overwrite)
     recording = open_source(options.source)
@@ -159,7 +159,7 @@ def _refuse_blind(drive: Drive, options: FloorOptions, height_m: float) -> None:
 
 
 def _halves_deg(drive: Drive) -> float:
-    """Return by how much the second half of the way tells another tilt than the first, from how the estimate moved."""
+    """Return by how much the tilt of the way's halves differs, from how the estimate moved."""
     way = drive.way_m
     half = int(np.searchsorted(way, 0.5 * way[-1]))
     first, second = drive.tilt_sigma_deg[half] ** -2, drive.tilt_sigma_deg[-1] ** -2
@@ -302,7 +302,7 @@ def draw(figure: Figure, colors: Mapping[str, str], found: FloorCalibration) -> 
         left.plot(way, off, color=color, label=f"{name}, {value[-1]:.2f} deg at the end")
         left.fill_between(way, off - sigma, off + sigma, color=color, alpha=0.2, linewidth=0)
     reach = 3.0 * float(np.max(np.abs(found.drive.tilt_deg[len(way) // 2 :] - found.tilt_deg), initial=0.1))
-    left.set(xlabel="way [m]", ylabel="against the end [deg]", title="what the floor tells", ylim=(-reach, reach))
+    left.set(xlabel="way [m]", ylabel="against the end [deg]", title="what the floor shows", ylim=(-reach, reach))
     left.legend(loc="upper right")
     at = found.drive.T_start_body[:, :2, 3]
     right.plot(at[:, 0], at[:, 1], color=colors["axis-x"])

@@ -1,9 +1,9 @@
 """Intrinsics of a camera from views of a board: Zhang's method through OpenCV, then our own refinement with sigmas.
 
-Zhang, "A flexible new technique for camera calibration", PAMI 2000. OpenCV tells no sigmas for fisheye lenses and none
+Zhang, "A flexible new technique for camera calibration", PAMI 2000. OpenCV gives no sigmas for fisheye lenses and none
 that hold when the errors of one view belong together (a bent board, blur). Here both models are refined by
 Gauss-Newton on `vislam.core.camera.Camera`, the poses eliminated; sigmas come from the scatter of residuals, or from
-leaving out one view at a time (a jackknife of one step) where that says more.
+leaving out one view at a time (a jackknife of one step) where that is larger.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class LensFit:
     covariance: Array  # [P, P] of fx, fy, cx, cy, the skew if it was estimated, then the coefficients
     T_cam_board: tuple[Array, ...]  # [4, 4] per view
     residuals_px: tuple[Array, ...]  # [N, 2] per view, NaN where left out as outlier
-    rms_px: float  # over both coordinates of a corner together, as OpenCV tells it
+    rms_px: float  # over both coordinates of a corner together, as OpenCV reports it
     outliers: int
     grouping: float  # variance between views over that which independent corners explain; 1 when they are independent
     with_skew: bool = False
@@ -151,7 +151,7 @@ def _residuals(camera: Camera, T_cam_board: Array, view: View) -> Array:
 
 @dataclass(slots=True)
 class _Block:
-    """One view linearised: what it says of the parameters once its pose is eliminated."""
+    """One view linearised: what it contributes to the parameters once its pose is eliminated."""
 
     H: Array  # [P, P]
     g: Array  # [P]

@@ -26,8 +26,8 @@ from vislam.datasets.stream import Survey, frame_table, with_depth_format
 from vislam.datasets.tables import Problems
 
 _FILES = ("sensor.yaml", "rgbd.png", "rgbd.json")
-_WORTH = 2.0  # sigmas: what is nearer to nothing stays as it was told
-_SCALE = "the unit of depth cannot be told from images and depth: measure something of known length in the map"
+_WORTH = 2.0  # sigmas: what is nearer to nothing stays as it was given
+_SCALE = "the unit of depth cannot be found from images and depth: measure something of known length in the map"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +102,7 @@ def _refuse_blind(source: str, facts: RgbdFacts, sure: Known) -> None:
 
 
 def _mended(found: Survey, facts: RgbdFacts, sure: Known) -> Survey:
-    """Return a recording with what was measured in the place of what was told, where it is known and worth it."""
+    """Return a recording with what was measured in the place of what was given, where it is known and worth it."""
     how, rig = found.depth_format, found.rig
     invalid = tuple(odd.value for odd in facts.odd_values if not odd.is_known)
     offset_px, time_offset_s = how.offset_px, how.time_offset_s
@@ -126,9 +126,9 @@ def _mended(found: Survey, facts: RgbdFacts, sure: Known) -> Survey:
 
 def _statements(found: RgbdCalibration) -> list[str]:
     """Return what a user must know of how far the numbers can be trusted."""
-    told = {"the place of depth": found.sure.offset, "its lag": found.sure.lag, "the focal length": found.sure.focal}
-    unknown = [what for what, is_sure in told.items() if not is_sure]
-    said = [f"{' and '.join(unknown)} could not be told and stays as it was"] if unknown else []
+    sure = {"the place of depth": found.sure.offset, "its lag": found.sure.lag, "the focal length": found.sure.focal}
+    unknown = [what for what, is_sure in sure.items() if not is_sure]
+    said = [f"{' and '.join(unknown)} could not be found and stays as it was"] if unknown else []
     return [*said, _SCALE]
 
 

@@ -81,7 +81,7 @@ def live_images(source: ImageSource, seconds: float, clock: Callable[[], float] 
     while clock() < end:
         captured = source.read(_LIVE_WAIT_S)
         if captured is None:
-            raise DataError("the camera gives no images; `vislam doctor` tells more")
+            raise DataError("the camera gives no images; `vislam doctor` shows more")
         image = captured.image
         yield f"image {captured.index}", image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         time.sleep(min(_LIVE_EVERY_S, max(end - clock(), 0.0)))

@@ -34,7 +34,7 @@ class CameraImuResult:
     """The answer, and what the recording's own files say."""
 
     solved: HandEye
-    told: Array  # [4, 4] T_body_cam of the recording
+    given: Array  # [4, 4] T_body_cam of the recording
     frames: int
     metric: bool  # stereo or depth, not one camera alone
 
@@ -55,7 +55,7 @@ def calibrate_camera_imu(options: CameraImuOptions) -> Outcome:
 
 
 def solve_camera_imu(recording: Recording, options: CameraImuOptions) -> CameraImuResult:
-    """Return rotation and offset; raises DataError that says what the motion lacks."""
+    """Return rotation and offset; raises DataError that names what the motion lacks."""
     if recording.imu_noise is None:
         raise DataError(f"{options.source} has no IMU; record camera and IMU together")
     what = f"camera against IMU in {options.source}"
@@ -123,7 +123,7 @@ def _doubts(solved: HandEye) -> list[str]:
 def _chain(result: CameraImuResult, recording: Recording) -> list[CameraCalibration]:
     """Return the chain: rotation and offset as found, translation as the recording has it."""
     rig, solved = recording.rig, result.solved
-    T_body_cam = transform(solved.R_body_cam, result.told[:3, 3].copy())
+    T_body_cam = transform(solved.R_body_cam, result.given[:3, 3].copy())
     chain = [CameraCalibration(rig.cameras[0], T_body_cam, solved.time_offset_s, float(solved.sigmas[3]))]
     for camera, T in zip(rig.cameras[1:], rig.T_body_cams[1:], strict=True):
         pose = T_body_cam @ invert(rig.T_body_cams[0]) @ T
@@ -132,13 +132,13 @@ def _chain(result: CameraImuResult, recording: Recording) -> list[CameraCalibrat
 
 
 def _difference_deg(result: CameraImuResult) -> float:
-    return float(np.rad2deg(np.linalg.norm(so3_log(result.told[:3, :3].T @ result.solved.R_body_cam))))
+    return float(np.rad2deg(np.linalg.norm(so3_log(result.given[:3, :3].T @ result.solved.R_body_cam))))
 
 
 def _statements(result: CameraImuResult) -> list[str]:
-    told = ", ".join(f"{x:.3f}" for x in result.told[:3, 3])
+    given = ", ".join(f"{x:.3f}" for x in result.given[:3, 3])
     said = [
-        f"translation is not determined by turns: it is the ({told}) m of the recording; measure it with a ruler",
+        f"translation is not determined by turns: it is the ({given}) m of the recording; measure it with a ruler",
         "a lens or a gyroscope that is off by 1 % turns the answer by about as much of the turns between frames; "
         "calibrate both before",
     ]
@@ -170,7 +170,7 @@ def _report(result: CameraImuResult) -> dict[str, Any]:
         "grouping": solved.grouping,
         "correlation": float(solved.correlation[:, 1].max()),
         "turned_deg": np.rad2deg(solved.turned_rad).tolist(),
-        "translation_m": result.told[:3, 3].tolist(),
+        "translation_m": result.given[:3, 3].tolist(),
         "translation_determined": False,
         "statements": _statements(result),
     }
@@ -184,7 +184,7 @@ def _lines(result: CameraImuResult) -> list[str]:
     return [
         f"{solved.pairs} rotations from {result.frames} frames, usually {residual_deg:.3f} deg from the gyroscope's",
         f"R_body_cam [{rows}]",
-        f"sigma about the IMU's axes {sigmas} deg; {_difference_deg(result):.2f} deg from what the recording says",
+        f"sigma about the IMU's axes {sigmas} deg; {_difference_deg(result):.2f} deg from what the recording states",
         f"time offset {1e3 * solved.time_offset_s:+.2f} ± {1e3 * solved.sigmas[3]:.2f} ms, to be added to the stamps "
         "of the camera",
         *_statements(result),

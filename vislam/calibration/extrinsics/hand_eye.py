@@ -22,8 +22,8 @@ _GRID_S = 0.005
 _ROUNDS = 15
 _CONVERGED = 1e-3  # sigmas
 _CAUCHY = 3.0
-_FLOOR_RAD = 1e-4  # of a visual rotation: nobody is better
-_BLOCKS = 20  # of time, whose omission tells how errors that last show
+_FLOOR_RAD = 1e-4  # of a visual rotation: none is better
+_BLOCKS = 20  # of time, whose omission shows the effect of errors that last
 _BIAS_SIGMA = 1.0  # rad/s, prior: keeps the problem regular without a turn
 
 

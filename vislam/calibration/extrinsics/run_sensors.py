@@ -13,7 +13,7 @@ from vislam.core.reading import read_json
 from vislam.sensors.sensor import Variable
 from vislam.sensors.toml import load_sensor_setup
 
-_LEARNT = 0.5  # of the sigma that a variable began with: above it the run says little that was not told it
+_LEARNT = 0.5  # of the sigma that a variable began with: above it the run adds little to what was given
 _ESTIMATORS = ("graph", "filter")  # the graph has seen all of the run, the filter what came before
 
 
@@ -37,7 +37,7 @@ class _Found(NamedTuple):
 def calibrate_sensors(options: SensorsOptions) -> Outcome:
     """Write tables `[sensors.NAME.known]` with value and sigma of each own variable that a run has found.
 
-    Left out is what another run finds anew (the heading of a frame), what walks, and what is hardly better known than
+    Left out is what another run finds again (the heading of a frame), what walks, and what is hardly better known than
     before the run.
 
     Raises:
@@ -70,10 +70,10 @@ def _found(run: Path) -> dict[str, list[_Found]]:
     if not isinstance(file, str):
         raise UsageError(f"{run} had no further sensors; run with --sensors.file cart.toml, docs/more-sensors.md")
     suite = load_sensor_setup(Path(file)).suite
-    told = metrics.get("sensors")
-    if not isinstance(told, dict) or set(told) != set(suite.names):
+    found = metrics.get("sensors")
+    if not isinstance(found, dict) or set(found) != set(suite.names):
         raise DataError(f"{run / 'metrics.json'} has not the sensors of {file}; was that file changed? run it again")
-    return {name: _of_sensor(suite[name].variables, told[name], run) for name in suite.names}
+    return {name: _of_sensor(suite[name].variables, found[name], run) for name in suite.names}
 
 
 def _of_sensor(variables: tuple[Variable, ...], entry: Mapping[str, Any], run: Path) -> list[_Found]:

@@ -1,6 +1,6 @@
 """Hard and soft iron of a magnetometer: an ellipse in the levelled plane, or an ellipsoid.
 
-A cart that only turns about its vertical says nothing of the vertical offset: the ellipsoid is then not determined at
+A cart that only turns about its vertical shows nothing of the vertical offset: the ellipsoid is then not determined at
 all, the ellipse is. Points `m` obey `|A (m - c)| = r`; A is symmetric (a rotation in front of it leaves the length as
 it is) with determinant one, so that the field keeps its strength.
 """

@@ -29,7 +29,7 @@ from vislam.imu import ImuCalibration
 
 _FILES = ("imu.yaml", "imu.png", "imu.json")
 _NAMES = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
-_QUIET_SHARE = 0.1  # of the time that somebody holds the sensor still at least
+_QUIET_SHARE = 0.1  # of the time, at least, in which the sensor is held still
 _FACTORS = (2.0, 3.0, 4.0, 6.0, 10.0)  # times the quiet spread that still is rest; the best one is chosen
 _APART_COS = np.cos(np.deg2rad(20.0))  # nearer directions are one pose
 _MIN_DIRECTIONS = {"full": 10, "scale": 7}  # one more than the unknowns: without redundancy nothing can be checked
@@ -161,7 +161,7 @@ def _raw_directions(rests: list[Rest]) -> Array:
     means = np.array([rest.accel for rest in rests])
     centre, radius = sphere_through(means) if len(means) > 5 else (np.zeros(3), 0.0)
     length = np.median(np.linalg.norm(means, axis=1))
-    if not 0.7 * length < radius < 1.4 * length:  # no sphere can be told from so few or so flat
+    if not 0.7 * length < radius < 1.4 * length:  # no sphere can be fitted to so few or so flat
         centre = np.zeros(3)
     return np.asarray((means - centre) / np.linalg.norm(means - centre, axis=1, keepdims=True))
 

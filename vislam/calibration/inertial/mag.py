@@ -22,7 +22,7 @@ from vislam.datasets.imu_files import mag_calibration_text, read_imu_calibration
 from vislam.imu import MagCalibration
 
 _FILES = ("mag.yaml", "mag.png", "mag.json")
-_UP_S = 0.5  # over which force is averaged to tell where up is
+_UP_S = 0.5  # over which force is averaged to find where up is
 _MAX_TILT_DEG = 12.0  # from the usual attitude: more is no turn on the floor
 _MAX_GAP_DEG = 40.0  # between neighbouring headings of a turn
 _SPHERE_SECTORS = 50  # directions that a turn by hand has to come near to
@@ -165,7 +165,7 @@ def _doubts(fit: IronFit) -> list[str]:
 
 
 def _inertial(options: MagOptions) -> Table:
-    """Return inertial samples, calibrated by the file that is named or by what the recording itself says."""
+    """Return inertial samples, calibrated by the file that is named or by the recording's own."""
     table = read_inertial(options.source)
     own = None if options.source.is_file() else survey(str(options.source)).imu_calibration
     calibration = own if options.imu is None else read_imu_calibration(options.imu)

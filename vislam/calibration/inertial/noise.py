@@ -19,7 +19,7 @@ from vislam.datasets.imu_files import imu_noise_text
 from vislam.imu import ImuNoise, NoiseFloor, NoiseRatios
 
 _FILES = ("noise.yaml", "noise.png", "noise.json")
-_MOVED = 4.0  # times the usual spread: somebody touched it
+_MOVED = 4.0  # times the usual spread: it was touched
 LEAST_STILL_S = 300.0  # shorter, the bias walk of no sensor shows
 _MIN_SHARE = 0.5  # of the recording that must be still in one piece
 ENOUGH_STILL_S = 3600.0
@@ -32,7 +32,7 @@ _MIN_SAMPLES = 2000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseCalibration:
-    """What a still recording says of noise, per axis (gyro x y z, accel x y z) and as one model."""
+    """What a still recording shows of noise, per axis (gyro x y z, accel x y z) and as one model."""
 
     curves: tuple[AllanCurve, ...]
     fits: tuple[NoiseFit, ...]
@@ -122,7 +122,7 @@ def _statements(found: NoiseCalibration) -> list[str]:
     said = [f"{found.still_s:.0f} s still at {found.model.rate_hz:.1f} Hz; white noise to {_worst_white(found):.1%}"]
     limits = [name for name, fit in zip(_NAMES, found.fits, strict=True) if not fit.walk_determined]
     if limits:
-        advice = "" if found.still_s > ENOUGH_STILL_S else f"; {ENOUGH_STILL_S / 3600.0:.0f} h or more would tell"
+        advice = "" if found.still_s > ENOUGH_STILL_S else f"; {ENOUGH_STILL_S / 3600.0:.0f} h or more would show it"
         said.append(f"bias walk of {', '.join(limits)} does not stand out and counts with its upper limit{advice}")
     misfits = [name for name, fit in zip(_NAMES, found.fits, strict=True) if fit.misfit > 5.0]
     if misfits:

@@ -1,4 +1,4 @@
-"""Raw samples kept in memory while somebody moves the sensor, and written as a recording in the end."""
+"""Raw samples kept in memory while a user moves the sensor, and written as a recording in the end."""
 
 from __future__ import annotations
 

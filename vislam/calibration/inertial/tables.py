@@ -60,7 +60,7 @@ class Table:
 def read_inertial(source: Path) -> Table:
     """Return rates (rad/s) and forces (m/s^2) [N, 6] of a recording, a GoPro's film or a csv file as `imu0/data.csv`.
 
-    What the recording's own calibration says is not applied. Raises DataError when there is no such table or it is
+    The recording's own calibration is not applied. Raises DataError when there is no such table or it is
     too short.
     """
     return _read(source, "imu_file", "imu0/data.csv", 6)

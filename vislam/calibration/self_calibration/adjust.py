@@ -1,7 +1,7 @@
 """All stretches adjusted together over one lens: Levenberg-Marquardt, points and poses of each stretch eliminated.
 
-What a stretch says of the shared unknowns, once its own are gone, is one small matrix: so memory does not grow with
-the recording, and leaving a stretch out costs one more solution of a small system.
+What a stretch contributes to the shared unknowns, once its own are gone, is one small matrix: so memory does not grow
+with the recording, and leaving a stretch out costs one more solution of a small system.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _MEDIAN_2 = 1.386  # of chi-square with two degrees of freedom
 _GATE = 6.0  # standard deviations beyond which an observation is no measurement ...
 _GATE_SHARE = 0.001  # ... unless it is nearer than this of the image's width: gates that close on themselves bias
 _LEAST_SEEN = 3
-_LEAST_FLOWS = 12  # tracks of a keyframe that may tell how the camera moved
+_LEAST_FLOWS = 12  # tracks of a keyframe that may show how the camera moved
 _LEAST_DAMPING, _MOST_DAMPING = 1e-8, 1e6
 _CONVERGED = 1e-5  # relative change of the cost
-_RIDGE = 1e-9  # relative: keeps free scales and points that nobody places regular
+_RIDGE = 1e-9  # relative: keeps free scales and points without a constraint regular
 _MAX_RHO = 50.0  # in units of the usual distance
 
 
@@ -129,7 +129,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
-    """What one stretch says of the shared unknowns, and how its own follow them."""
+    """What one stretch contributes to the shared unknowns, and how its own follow them."""
 
     H: Array  # [SHARED, SHARED]
     g: Array  # [SHARED]
@@ -146,7 +146,7 @@ def adjust(
     iterations: int,
     damping: float = 1e-3,
 ) -> tuple[list[Piece], Shared, float]:
-    """Return pieces, shared unknowns and cost after so many steps at most; only `free` [SHARED] ones move."""
+    """Return pieces, shared unknowns and cost after `steps` steps at most; only `free` [SHARED] ones move."""
     pieces = list(pieces)
     cost = _cost(pieces, shared, prior, sigma_px)
     for _ in range(iterations):
@@ -179,7 +179,7 @@ def adjust(
 
 
 def reduce_all(pieces: Sequence[Piece], shared: Shared, sigma_px: float) -> list[Reduced]:
-    """Return what each stretch says, undamped."""
+    """Return what each stretch contributes, undamped."""
     return [_reduced(piece, shared, sigma_px, 0.0) for piece in pieces]
 
 
@@ -298,7 +298,7 @@ def _equations(seen: Linear, weight: Array, n: int, m: int) -> tuple[Array, Arra
 
 
 def _add_turns(U: Array, g: Array, rows: TurnRows, n: int) -> None:
-    """Add what the gyroscope says of successive keyframes."""
+    """Add what the gyroscope measures between successive keyframes."""
     chi2 = rows.information * np.sum(rows.errors**2, axis=1)
     weight = rows.information / (1.0 + chi2 / _CAUCHY**2)
     shared = np.arange(6 * n + GYRO, 6 * n + SHARED)

@@ -1,6 +1,6 @@
 """A focal length from depth images, where a recording has them: images alone are misled by more than they show.
 
-Depth and pixels of rigid points tell the focal length another way than tracks do (`vision/depth_focal.py`): it joins in
+Depth and pixels of rigid points show the focal length another way than tracks do (`vision/depth_focal.py`): it joins in
 as one measurement, against which the images weigh as much as their widened sigmas allow.
 """
 
@@ -21,11 +21,11 @@ from vislam.datasets.tables import Problems
 from vislam.vision.depth_focal import FocalFit
 
 _WORST = 0.02  # relative sigma: worse is no help
-_LEAST_SIGMA = 0.004  # of what depth says, too: a sensor's own registration is no better
+_LEAST_SIGMA = 0.004  # of what depth shows, too: a sensor's own registration is no better
 
 
 def focal_by_depth(source: str, camera: Camera) -> FocalFit | str:
-    """Return what depth says of a camera's focal length, or why it does not; empty: the recording has no depth."""
+    """Return what depth shows of a camera's focal length, or why it does not; empty: the recording has no depth."""
     try:
         found = survey(source)
         if found.rig is None or found.depth is None:
@@ -41,7 +41,7 @@ def focal_by_depth(source: str, camera: Camera) -> FocalFit | str:
         return str(error)
     if fit is None:
         return "too little moves past edges of depth"
-    return fit if fit.sigma < _WORST else f"they tell it to {fit.sigma:.1%} only"
+    return fit if fit.sigma < _WORST else f"they show it to {fit.sigma:.1%} only"
 
 
 def with_focal(solution: Solution, known: Certainty, fit: FocalFit) -> Solution:

@@ -1,7 +1,7 @@
 """Turns by the gyroscope against those of a stretch's keyframes: rows for the joint adjustment.
 
 The rotation part of Kalibr (Furgale et al., IROS 2013), by `imu/gyro_turns.py`, with the gyroscope's scale unknown as
-far as its calibration leaves it: an exact one would tell the focal length better than most cameras can.
+far as its calibration leaves it: an exact one would give the focal length better than most cameras can.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ def with_gyro(solution: Solution, gyro: Gyro) -> Solution | str:
 
 
 def refined(solution: Solution) -> Solution:
-    """Return the solution with all unknowns free, every point placed anew and judged, round after round."""
+    """Return the solution with all unknowns free, every point placed again and judged, round after round."""
     prior, sigma_px = solution.prior, solution.sigma_px
     pieces, shared = solution.pieces, solution.shared
     free = shared.free
@@ -165,7 +165,7 @@ def _swept(segments: Sequence[Segment], camera: Camera, prior: Prior) -> Shared 
 
 
 def _placed(piece: Piece, camera: Camera) -> Piece:
-    """Return the piece with all its points triangulated anew, also those that were left out."""
+    """Return the piece with all its points triangulated again, also those that were left out."""
     found = placed_points(piece.segment, camera, piece.at.R, piece.at.centre, piece.at.origin)
     if found is None:
         return piece

@@ -29,7 +29,7 @@ _OWN = 4  # scale and gravity of a stretch
 _GRAVITY_M_S2, _GRAVITY_SIGMA = 9.81, 0.05  # what it differs by on earth, and the scale that a calibration leaves
 _ARM_M, _BIAS_M_S2 = 1.0, 0.5  # what is taken of mounts and accelerometers in general, one sigma
 _ATTITUDE_RAD = 1e-3  # of keyframes
-_START_M = 0.005  # noise of centres, before residuals tell it
+_START_M = 0.005  # noise of centres, before residuals show it
 _LEAST_M = 1e-4
 _ROUNDS = 6
 _LEAST_STRETCHES = 3
@@ -130,7 +130,7 @@ def _reduced(parts: Sequence[_Rows], own: Array, sigma_m: float) -> tuple[Array,
         WA = _information(rows, sigma_m) @ rows.A
         N, right = rows.A.T @ WA, WA.T @ rows.b
         length = float(np.linalg.norm(at[1:]))
-        if length > 0.0:  # gravity's direction is known from the round before, and so its length can be told
+        if length > 0.0:  # gravity's direction is known from the round before, and so its length can be found
             along = at[1:] / length / _GRAVITY_SIGMA
             N[1:_OWN, 1:_OWN] += np.outer(along, along)
             right[1:_OWN] += along * _GRAVITY_M_S2 / _GRAVITY_SIGMA

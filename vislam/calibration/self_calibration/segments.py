@@ -19,7 +19,7 @@ from vislam.frontend.tracker import Tracker
 
 _SPACING = 0.045  # of the image's width that tracks have moved at the next keyframe
 _ALIVE = 0.6  # share of tracks below which there is a keyframe in any case
-_LONGEST_S = 1.0  # between keyframes: longer, and inertial dead reckoning says nothing
+_LONGEST_S = 1.0  # between keyframes: longer, and inertial dead reckoning adds nothing
 _LINKED = 30  # tracks that keyframes must share to stand in one stretch
 _KEYFRAMES = 20  # of a stretch
 LEAST_KEYFRAMES = 6
@@ -109,7 +109,7 @@ class _Follower:
 
 
 def follow_segments(frames: Iterable[Frame], width_px: int, most: int) -> list[Segment]:
-    """Return the stretches of a recording, at most so many, spread evenly over it."""
+    """Return the stretches of a recording, at most `most`, spread evenly over it."""
     config = replace(FrontEndConfig(), max_tracks=300)
     follower = _Follower(Tracker(config), _SPACING * width_px)
     for frame in frames:

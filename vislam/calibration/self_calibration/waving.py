@@ -41,7 +41,7 @@ _MAX_CENTRE_SIGMA = 0.02  # of the image's width
 _MAX_SIGMA_PX = 2.0  # noise of tracks: more, and what moves is the scene, or it is all blur
 _GLOBAL_S = 0.003  # a shorter readout than this counts as a global shutter
 _SAME = 3.0  # sigmas
-_GYRO_SCALE = 0.01  # of a gyroscope of which nothing is told
+_GYRO_SCALE = 0.01  # of a gyroscope of which nothing is known
 _MAX_TURN_SIGMA_DEG = 0.5
 _MAX_OFFSET_SIGMA_S = 0.003
 _MAX_ARM_SIGMA_M = 0.01  # about what a ruler gives
@@ -54,8 +54,8 @@ class SelfResult:
     solution: Solution
     known: Certainty
     segments: int  # that were followed, whether or not they could be reconstructed
-    told: Rig  # of the recording
-    without_imu: str  # why nothing is said of the IMU; empty where there is something
+    given: Rig  # of the recording
+    without_imu: str  # why there is no result for the IMU; empty where there is something
     widened: float  # of the sigmas
     by_depth: FocalFit | str = ""  # what depth images said of the focal length, or why nothing; empty: there are none
     lever: LeverArm | None = None  # where the camera sits on the IMU
@@ -93,7 +93,7 @@ def calibrate_self(options: SelfOptions) -> Outcome:
 
 
 def solve_self(recording: Recording, options: SelfOptions) -> SelfResult:
-    """Return the lens; raises DataError that says what the motion lacks."""
+    """Return the lens; raises DataError that names what the motion lacks."""
     what = f"the camera of {options.source}"
     start = _guess(recording.rig.cameras[0], options)
     samples: list[ImuSample] = []
@@ -149,7 +149,7 @@ def _with_imu(result: SelfResult, recording: Recording, samples: list[ImuSample]
 
 def _chain(result: SelfResult) -> list[CameraCalibration]:
     """Return the chain: translation against the IMU, and the second camera, as the recording has them."""
-    shared, rig = result.solution.shared, result.told
+    shared, rig = result.solution.shared, result.given
     alone = shared.gyro is None
     T_body_cam0 = rig.T_body_cams[0] if alone else _pose(result)
     offset_s, sigma_s = (None, None) if alone else (shared.time_offset_s, float(result.known.sigmas[GYRO + OFFSET]))
@@ -161,20 +161,20 @@ def _chain(result: SelfResult) -> list[CameraCalibration]:
 
 def _pose(result: SelfResult) -> Array:
     R_body_cam = np.ascontiguousarray(result.solution.shared.R_cam_body.T)
-    told_m = result.told.T_body_cams[0][:3, 3].copy()
-    return transform(R_body_cam, told_m if result.arm_m is None else result.arm_m)
+    given_m = result.given.T_body_cams[0][:3, 3].copy()
+    return transform(R_body_cam, given_m if result.arm_m is None else result.arm_m)
 
 
-def _guess(told: Camera, options: SelfOptions) -> Camera:
-    """Return the camera to begin with: of what a recording says of its own only the size is used."""
+def _guess(given: Camera, options: SelfOptions) -> Camera:
+    """Return the camera to begin with: of the recording's own only the size is used."""
     model: Model = "equidistant" if options.fov_deg > _WIDE_DEG else "radtan5"
     if options.model != "auto":
         model = options.model
     wide = model == "equidistant"
     half = 0.5 * np.deg2rad(options.fov_deg)
-    focal = 0.5 * told.width / (half if wide else np.tan(half))
+    focal = 0.5 * given.width / (half if wide else np.tan(half))
     return Camera(
-        told.width, told.height, focal, focal, 0.5 * (told.width - 1), 0.5 * (told.height - 1), 0.0,
+        given.width, given.height, focal, focal, 0.5 * (given.width - 1), 0.5 * (given.height - 1), 0.0,
         "equidistant" if wide else "radtan", (0.0,) * COEFFICIENTS[model],
     )  # fmt: skip
 
@@ -193,7 +193,7 @@ def _frames(recording: Recording, max_s: float, samples: list[ImuSample]) -> Ite
 
 
 def _rematched(recording: Recording, options: SelfOptions, pieces: Sequence[Piece], shared: Shared) -> list[Segment]:
-    """Read the images again, those of one stretch at a time, and match its observations anew."""
+    """Read the images again, those of one stretch at a time, and match its observations again."""
     frames = _frames(recording, options.max_s, [])
     out = []
     for piece in pieces:
@@ -273,7 +273,7 @@ def _statements(result: SelfResult) -> list[str]:
         said.append(
             f"depth images say that the focal length is {fit.factor - 1.0:+.1%} ± {fit.sigma:.1%} of what tracks do"
         )
-    if result.told.is_stereo:
+    if result.given.is_stereo:
         said.append("of two cameras the first was calibrated; the second stands as the recording has it")
     lost = result.segments - len(result.solution.pieces)
     if lost:
@@ -348,8 +348,8 @@ def _imu_report(result: SelfResult) -> dict[str, Any]:
 
 
 def _difference_deg(result: SelfResult) -> float:
-    """Return by how much the rotation against the IMU differs from what the recording says."""
-    turn = so3_log(np.ascontiguousarray(result.solution.shared.R_cam_body @ result.told.T_body_cams[0][:3, :3]))
+    """Return by how much the rotation against the IMU differs from what the recording states."""
+    turn = so3_log(np.ascontiguousarray(result.solution.shared.R_cam_body @ result.given.T_body_cams[0][:3, :3]))
     return float(np.rad2deg(np.linalg.norm(turn)))
 
 
@@ -381,7 +381,7 @@ def _imu_lines(result: SelfResult) -> list[str]:
     return [
         f"R_body_cam [{rows}], sigma about the camera's axes "
         f"{', '.join(f'{x:.2f}' for x in np.rad2deg(sigmas[:3]))} deg; {_difference_deg(result):.2f} deg from what the "
-        "recording says",
+        "recording states",
         _arm_line(result),
         f"time offset {1e3 * shared.time_offset_s:+.2f} ± {1e3 * sigmas[OFFSET]:.2f} ms, to be added to the stamps of "
         "the camera",
@@ -391,7 +391,7 @@ def _imu_lines(result: SelfResult) -> list[str]:
 def _arm_line(result: SelfResult) -> str:
     lever = result.lever
     if lever is None:
-        return "translation: the accelerometer does not tell it; the recording's own is written"
+        return "translation: the accelerometer does not show it; the recording's own is written"
     numbers = ", ".join(
         f"{x:+.1f} ± {s:.1f}" for x, s in zip(1e2 * lever.arm_m, 1e2 * lever.known.sigmas[:3], strict=True)
     )

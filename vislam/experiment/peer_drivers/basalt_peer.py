@@ -72,7 +72,7 @@ class Odometry:
         self._inputs = [node.left.createInputQueue(16, True), node.right.createInputQueue(16, True)]
         self._samples = node.imu.createInputQueue(16, True)
         self._poses = node.transform.createOutputQueue(10_000, False)
-        self._passed = node.passthrough.createOutputQueue(10_000, False)  # it waits until somebody takes them
+        self._passed = node.passthrough.createOutputQueue(10_000, False)  # it waits until they are taken
         self.answers, self.first_cpu_s = [], None
         self._pipeline.start()
         threading.Thread(target=self._listen, daemon=True).start()
@@ -166,8 +166,8 @@ def prepared(mode, root, out, work, pace, package):
     library = next(Path(depthai.__file__).parent.glob("depthai.libs/libdepthaicore*.so"), None)
     if library is None:
         sys.exit(f"this depthai ({depthai.__file__}) has no libdepthaicore to put the shim before")
-    told = {"DAI_CALIB": f"{work}/calibration.json", "DAI_LIB": library.name, "LD_PRELOAD": f"{work}/shim.so"}
-    os.execve(sys.executable, [sys.executable, __file__, "run", root, out, pace], {**os.environ, **told})
+    settings = {"DAI_CALIB": f"{work}/calibration.json", "DAI_LIB": library.name, "LD_PRELOAD": f"{work}/shim.so"}
+    os.execve(sys.executable, [sys.executable, __file__, "run", root, out, pace], {**os.environ, **settings})
 
 
 def main():
@@ -187,7 +187,7 @@ def main():
         odometry.wait(i)
         odometry.give(i)
     odometry.finish()
-    outcome.tell(out)
+    outcome.report(out)
     os._exit(0)  # the pipeline's threads do not end by themselves
 
 

@@ -3,7 +3,7 @@
     python orbslam3_peer.py MODE ROOT OUT.tum VOCABULARY PACE [FINAL.tum "pyorbslam3 VERSION"]
 
 MODE: rgbd (ROOT is a TUM freiburg1 folder), stereo or mono (with the IMU; ROOT is a EuRoC folder). Local mapping and
-loop closing are threads that take what is there, so PACE says how fast frames come: 1 is as they were recorded.
+loop closing are threads that take what is there, so PACE sets how fast frames come: 1 is as they were recorded.
 Settings are those of the examples that ORB-SLAM3 brings for these cameras. Poses are those that tracking returns with
 each frame; those in FINAL.tum are what ORB-SLAM3 saves in the end. This file is MIT; ORB-SLAM3 is GPL-3.0, and nothing
 of vislam runs in this process.
@@ -166,7 +166,7 @@ def main():
                 outcome.add(t_ns, np.array(result.pose_wc) @ T_cam_body)
         time.sleep(_DRAIN_S)
         system.shutdown()
-        outcome.tell(out)
+        outcome.report(out)
         if final:
             write_tum(final[0], saved(system, recording, T_cam_body, work, outcome.rows))
 

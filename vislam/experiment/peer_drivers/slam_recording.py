@@ -1,7 +1,7 @@
 """What the SLAM peers need of a recording, read without vislam so that they do not pay for its imports.
 
 `Euroc` and `TumRgbd` list images, inertial samples and calibration; `Outcome` keeps the poses that a peer published and
-tells what it cost. Used by orbslam3_peer.py and basalt_peer.py, which `vislam compare --peer` and
+reports what it cost. Used by orbslam3_peer.py and basalt_peer.py, which `vislam compare --peer` and
 benchmarks/peers_cost.py run in processes of their own, with an interpreter that has the peer.
 """
 
@@ -91,7 +91,7 @@ class TumRgbd:
 
 
 def require(words):
-    """End the process when a package has another version than "NAME VERSION" says: it is part of what a result is."""
+    """End the process when a package has another version than "NAME VERSION" states: it is part of what a result is."""
     name, wanted = words.split()
     if version(name) != wanted:
         sys.exit(f"{name} {version(name)} is installed here, {wanted} was asked for")
@@ -119,11 +119,11 @@ class Outcome:
             self._first = (t_ns - self._first_ns) * 1e-9, time.process_time() if cpu_s is None else cpu_s
         self.rows.append((t_ns, T_world_body))
 
-    def tell(self, out):
+    def report(self, out):
         """Write the trajectory to `out` and print the rest as a line of JSON."""
         write_tum(out, self.rows)
-        told = {"versions": self._versions, "frames": self._frames, "poses": len(self.rows)}
-        print(json.dumps(told | {"first_pose_s": self._first[0], "first_pose_cpu_s": self._first[1]}))
+        facts = {"versions": self._versions, "frames": self._frames, "poses": len(self.rows)}
+        print(json.dumps(facts | {"first_pose_s": self._first[0], "first_pose_cpu_s": self._first[1]}))
         sys.stdout.flush()
 
 

@@ -95,7 +95,7 @@ def tests_csv(comparisons: Sequence[Comparison]) -> str:
 
 
 def winners_csv(plan: Plan, winners: Sequence[Winner]) -> str:
-    """Return who wins by how much, over the plan (no sequence) and on each sequence; no estimate where nobody does."""
+    """Return who wins by how much, over the plan (no sequence) and on each sequence; no estimate where none does."""
     head = ["metric", "kind", "sequence", *plan.axis_names, "winner", "margin", "runner_up", "reason"]
     return _csv(
         head,

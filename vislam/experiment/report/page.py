@@ -54,7 +54,7 @@ _MEASURED = (
     "gravity: what they spread is chaos of the estimator, not a property of the data.",
     "Failed trials count as infinitely wrong in errors and their tests, and are left out of time and memory.",
     "Tests: Wilcoxon signed-rank on the median of each sequence, condition and seed (or over its seeds, where the "
-    "plan says so), corrected by Holm's method. With n pairs no p value is below 2/2^n.",
+    "plan asks for it), corrected by Holm's method. With n pairs no p value is below 2/2^n.",
     "Time per frame is that of the whole pipeline, on one thread of the machine that ran the job beside other jobs. "
     "CPU time is that of all threads of the run, reading and decoding included, without compilation.",
 )
@@ -114,9 +114,9 @@ def _head(plan: Plan, trials: Sequence[Trial], winners: Sequence[Winner], manife
         tile(str(len(failed)), "", "of them failed", "bad" if failed else "good"),
     )
     revision = str(manifest.get("code_revision") or "not under version control")
-    told = f"vislam {revision[:26]}, {manifest.get('finished', '')}, table {manifest.get('table_sha256', '')[:16]}"
+    made_by = f"vislam {revision[:26]}, {manifest.get('finished', '')}, table {manifest.get('table_sha256', '')[:16]}"
     answer = verdict(winners) or "There is only one estimate of each kind: nothing to win."
-    lead = f'<p class="verdict">{escape(answer)}</p><p class="lead">{escape(told)}</p>'
+    lead = f'<p class="verdict">{escape(answer)}</p><p class="lead">{escape(made_by)}</p>'
     return f'<h1>{escape(plan.title or plan.name)}</h1>{lead}<div class="tiles">{"".join(tiles)}</div>'
 
 
@@ -236,7 +236,7 @@ def _shown_trials(
 
 
 def _from_start(plan: Plan, groups: Sequence[Group], trials: Sequence[Trial]) -> list[str]:
-    """Return what tells how an estimate drifts: way and errors from a common first pose, and their RMS by axis."""
+    """Return what shows how an estimate drifts: way and errors from a common first pose, and their RMS by axis."""
     if not any(trial.start_curve for trial in trials):
         return []
     table_ = card(_accuracy(groups, FROM_START), title="RMS error by axis: median [range]")

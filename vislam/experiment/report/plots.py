@@ -1,4 +1,4 @@
-"""The pictures of a comparison: colour tells filter and graph apart, marker and line style the estimators."""
+"""The pictures of a comparison: colour separates filter and graph, marker and line style the estimators."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MARKERS = "os^Dv<>P"
 _LINES = ("-", "--", ":", "-.")
 MAX_PANELS = 24  # more cannot be compared by eye; the tables hold all
 WIDTH = 11.2
-PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # 0.02 says more than 2 x 10^-2
+PLAIN = FuncFormatter(lambda value, _: f"{value:g}")  # 0.02 is plainer than 2 x 10^-2
 
 
 def _by_condition(groups: Sequence[Group]) -> dict[str, list[Group]]:

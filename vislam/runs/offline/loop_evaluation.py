@@ -40,7 +40,7 @@ EVALUATION, EDGE_ERRORS = "loops_eval.json", "loops_eval.csv"
 _MAX_POINTS = 400  # of a curve that is stored
 _MAX_WORST = 20  # edges that are listed
 _TEMPORAL = 1  # keyframes before that must have pointed at the same place
-_MIN_EXPECTED = 0.005  # similarity to the keyframe before; below it, a ratio says nothing (Galvez-Lopez 2012)
+_MIN_EXPECTED = 0.005  # similarity to the keyframe before; below it, a ratio is meaningless (Galvez-Lopez 2012)
 
 Answer = tuple[int, float, int]  # row of the keyframe, score, verdict
 
@@ -192,7 +192,7 @@ def _rows_of(places: TruePlaces, pair: Any) -> tuple[int, int] | None:
 
 
 def _retrieved(retrieved: Sequence[RetrievedKeyframe], places: TruePlaces, persistence: int) -> Detections:
-    """Return the best answer of retrieval; with `persistence`, of the places that lasted for so many keyframes."""
+    """Return the best answer of retrieval; with `persistence`, of the places that lasted for this many keyframes."""
     answers: list[Answer] = []
     for found in retrieved:
         pair = _rows_of(places, found)
@@ -208,7 +208,7 @@ def _rescored(
     """Return what retrieval answered with its similarity in the run's last words, and that normalised.
 
     Normalised is the score of Galvez-Lopez and Tardos 2012, eq. 2: similarity over that of the keyframe to the one
-    before it, which tells what its view can reach at all. Keyframes that do not even look like that one have no such
+    before it, the most that its view can reach. Keyframes that do not even look like that one have no such
     answer. A run that trained no words is scored in those that come with vislam.
     """
     asked = {found.to_id for found in retrieved}

@@ -84,7 +84,7 @@ def _noise(
     except UsageError:
         if config.rescale_noise:
             raise
-        return problem, solution, ()  # the factor does not fit: nothing is told
+        return problem, solution, ()  # the factor does not fit: nothing is reported
     if not config.rescale_noise:
         return problem, solution, noise
     weights, applied = solution.weights, {kind.kind: 1.0 for kind in noise}

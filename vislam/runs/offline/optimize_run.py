@@ -25,11 +25,11 @@ from vislam.sensors import Suite
 from vislam.trajectory import Alignment, Trajectory, evaluate, read_tum, write_states_csv, write_tum
 
 _TAKEN = ("ekf", "live", "graph", "truth")  # names of trajectories that the run itself wrote
-_SECTIONS = ("frontend", "graph", "imu", "sensors")  # of the run's settings that batch goes by
+_SECTIONS = ("frontend", "graph", "imu", "sensors")  # of the run's settings that batch uses
 
 
 def optimize(run: Path, config: BatchConfig, name: str = "batch") -> dict[str, Any]:
-    """Estimate a run folder anew and write trajectory_NAME.tum, states_NAME.csv and the entry in metrics.json.
+    """Estimate a run folder again and write trajectory_NAME.tum, states_NAME.csv and the entry in metrics.json.
 
     Returns the entry: cost, what was used and refused, accuracy where the run has truth. Everything is computed before
     anything is written. Raises UsageError for what is no run folder, DataError for one that cannot be used.
@@ -95,14 +95,14 @@ def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config, Levelled]:
 
 def _suite(settings: Config, log: FactorLog) -> tuple[Suite | None, list[str]]:
     """Return the further sensors of the run, and why some of their readings are left out."""
-    suite, why = None, "the run was told no file of them"
+    suite, why = None, "the run was given no file of them"
     try:
         suite = suite_of(settings.sensors)
     except UsageError as error:
         why = str(error)
     known = () if suite is None else suite.names
-    told = {placed.reading.sensor for k in log.keyframes for placed in k.packet.readings}
-    left_out = sorted(told.difference(known))
+    used = {placed.reading.sensor for k in log.keyframes for placed in k.packet.readings}
+    left_out = sorted(used.difference(known))
     return suite, [f"the batch goes without the readings of {', '.join(left_out)}: {why}"] if left_out else []
 
 

@@ -78,11 +78,11 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         )
         mapper.move(nothing)
         total = len(placed) + len(config.products)
-        tell = _teller(progress, total)
+        report = _reporter(progress, total)
         if from_session:
-            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, tell)
+            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, report)
         else:
-            _from_recording(session, mapper, placed, read_setup(run)[0], ran, labels, tell)
+            _from_recording(session, mapper, placed, read_setup(run)[0], ran, labels, report)
     finally:
         session.close()
     mapper.finish()
@@ -91,7 +91,7 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     mapper = mapper.refined()
     folder = run / "map" if out is None else out
     steps = iter(range(len(placed), total))
-    written = mapper.export(folder, lambda product: tell(next(steps), product), level.not_level)
+    written = mapper.export(folder, lambda product: report(next(steps), product), level.not_level)
     path_m = np.array([T[:3, 3] for T in placed.values()]).reshape(-1, 3)
     pictures = write_pictures(mapper, folder, path_m, level.is_level)
     answer: dict[str, Any] = {
@@ -124,12 +124,12 @@ def _levelled(
     return level, mapper.turned(T), {i: T @ pose for i, pose in placed.items()}
 
 
-def _teller(progress: Progress | None, total: int) -> Callable[[int, str], None]:
-    def tell(done: int, note: str) -> None:
+def _reporter(progress: Progress | None, total: int) -> Callable[[int, str], None]:
+    def report(done: int, note: str) -> None:
         if progress is not None:
             progress(done, total, note)
 
-    return tell
+    return report
 
 
 def _same_extraction(ran: MapConfig, config: MapConfig, rig: Rig) -> bool:
@@ -217,12 +217,12 @@ def _from_session(
     nothing: GraphUpdate,
     at_once: int,
     labels: _Labels,
-    tell: Callable[[int, str], None],
+    report: Callable[[int, str], None],
 ) -> None:
     scans = {i: scan for i, scan in session.scans().items() if i in placed}
     mapper.restore(labels.given(scans, session), placed)
     for done in range(0, len(scans), at_once):
-        tell(done, "octree")
+        report(done, "octree")
         mapper.move(nothing)
 
 
@@ -239,7 +239,7 @@ def _from_recording(
     source: str,
     ran: Config,
     labels: _Labels,
-    tell: Callable[[int, str], None],
+    report: Callable[[int, str], None],
 ) -> None:
     recording = open_source(source, ran.seed, ran.calibration)
     stamps_ns = _camera_stamps_ns(session)
@@ -253,7 +253,7 @@ def _from_recording(
         keyframe = Keyframe(k.id, k.t_ns, frame, k.keypoints_px, k.descriptors, k.points_body_m)
         mapper.add(keyframe, placed[k.id], labels.of(value.t_ns))
         count += 1
-        tell(count, "recording")
+        report(count, "recording")
         if not stored:
             return
     first = next(iter(stored.values()))

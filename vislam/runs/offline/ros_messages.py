@@ -59,7 +59,7 @@ class RosMessages:
         pose_covariance: Array,
         velocity_covariance: Array,
     ) -> bytes:
-        """Return a nav_msgs/Odometry; the angular rate is not known to a run and says so by its variance.
+        """Return a nav_msgs/Odometry; the angular rate is not known to a run, as its variance shows.
 
         Args:
             t_ns: its stamp.
@@ -147,7 +147,7 @@ class RosMessages:
 
     def _time(self, t_ns: int) -> Any:
         if not 0 <= t_ns < _LATEST_NS:
-            raise DataError(f"a stamp of {t_ns} ns cannot be told in ROS, whose seconds are 0 to 2^31 - 1")
+            raise DataError(f"a stamp of {t_ns} ns cannot be expressed in ROS, whose seconds are 0 to 2^31 - 1")
         return self._make("builtin_interfaces/msg/Time", sec=t_ns // 10**9, nanosec=t_ns % 10**9)
 
     def _header(self, t_ns: int, frame: str) -> Any:
@@ -168,7 +168,7 @@ class RosMessages:
 
 
 def kept_for_late_joiners() -> Qos:
-    """Return the QoS of what is said once: whoever subscribes later gets it, too (ROS's latched topics)."""
+    """Return the QoS of what is sent once: a later subscriber gets it, too (ROS's latched topics)."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     always = QosTime(2147483647, 4294967295)

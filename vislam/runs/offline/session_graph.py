@@ -59,7 +59,7 @@ class SessionPart:
 
     @property
     def has_gravity(self) -> bool:
-        """Whether an IMU told which way is up."""
+        """Whether an IMU showed which way is up."""
         return self.memory.first_state is not None
 
     @property
@@ -83,7 +83,7 @@ def read_part(path: Path, name: str) -> SessionPart:
         raise DataError(f"{session.path} holds no map: not one keyframe, or gravity was not found")
     packets = memory.graph.packets
     if memory.first_state is None and not all(p.vo.has_scale for p in packets[1:] if not p.begins_submap):
-        raise DataError(f"{session.path} is of one camera without an IMU: nothing in it tells scale")
+        raise DataError(f"{session.path} is of one camera without an IMU: nothing in it shows scale")
     begins = [p.keyframe.id for p in packets if p.begins_submap and p.keyframe.id]
     submaps = Submaps()
     for k in begins:

@@ -17,7 +17,7 @@ from vislam.core.messages import Array
 _WIDTH = 3960
 _LEFT, _RIGHT, _TOP, _BOTTOM = 480, 70, 70, 360
 _FONT = 85
-_TICKS = 6  # about so many along an axis
+_TICKS = 6  # along an axis, about
 _MARGIN = 0.04  # of the range, beside what is drawn
 
 

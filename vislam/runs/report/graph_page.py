@@ -31,7 +31,7 @@ def write_graph_report(
 ) -> None:
     """Write report.html of an optimised pose graph. Raises StorageError.
 
-    Where the problem came from a file, `stated` is what that says of the poses [N, d + 1, d + 1] and their cost, which
+    Where the problem came from a file, `stated` is what it states of the poses [N, d + 1, d + 1] and their cost, which
     the page then shows as what was before; else it shows the start.
     """
     before, cost_before, of = (

@@ -55,9 +55,9 @@ def percent(value: Any, digits: int = 1) -> str:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]], text_columns: Sequence[int] = (0,)) -> str:
     """Return a table; columns in `text_columns` are left-aligned, the others hold numbers. Empty ones are left out."""
-    told = [k for k in range(len(head)) if not rows or any(_text_of(row[k]) for row in rows)]
-    head, rows = [head[k] for k in told], [[row[k] for k in told] for row in rows]
-    text_columns = [told.index(k) for k in text_columns if k in told]
+    kept = [k for k in range(len(head)) if not rows or any(_text_of(row[k]) for row in rows)]
+    head, rows = [head[k] for k in kept], [[row[k] for k in kept] for row in rows]
+    text_columns = [kept.index(k) for k in text_columns if k in kept]
 
     def kind(column: int) -> str:
         return "text" if column in text_columns else ""

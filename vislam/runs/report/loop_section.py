@@ -17,7 +17,7 @@ _DECISIONS = ("accepted", "pending", "rejected")
 
 
 def loops_section(run: RunFiles, scene: Scene) -> str:
-    """Return the section about loops; empty where the run tells nothing of them."""
+    """Return the section about loops; empty where the run reports nothing of them."""
     counts = as_dict(run.metrics, "loops")
     if not run.loops:
         return section("Loops", note("No candidates.")) if counts else ""
@@ -66,12 +66,12 @@ def _loop_quality(run: RunFiles) -> str:
 
 
 def _loop_pictures(run: RunFiles) -> str:
-    """Return the pictures of telling candidates, each with its line, folded but for the first of each kind."""
-    told = {(loop.from_id, loop.to_id, loop.decision): loop for loop in run.loops}
+    """Return the pictures of candidates worth seeing, each with its line, folded but for the first of each kind."""
+    decided = {(loop.from_id, loop.to_id, loop.decision): loop for loop in run.loops}
     cards: dict[str, list[str]] = {"accepted": [], "others": []}
     for path in run.loop_pictures:
         match = re.fullmatch(r"\d+_(\d+)_(\d+)_(accepted|pending|rejected)", path.stem)
-        loop = told.get((int(match[1]), int(match[2]), match[3])) if match else None
+        loop = decided.get((int(match[1]), int(match[2]), match[3])) if match else None
         if loop is None:
             continue
         try:

@@ -42,7 +42,7 @@ from vislam.runs.verdict import verdict_sentence
 def write_report(run: Path) -> Path:
     """Write `report.html` into a run folder and return its path.
 
-    A file that is absent leaves its section out, one that is damaged says so in the report. Raises DataError when the
+    A file that is absent leaves its section out, one that is damaged is named in the report. Raises DataError when the
     folder holds nothing of a run, StorageError when the report cannot be written.
     """
     files = read_run(run)
@@ -119,8 +119,8 @@ def _about(run: RunFiles) -> str:
     for name, sensor in (("gyro", "Gyroscope"), ("accel", "Accelerometer")):
         noise = as_dict(m, "imu_noise", name)
         if noise:
-            told, seen = number(noise.get("told"), 5), number(noise.get("typical"), 5)
-            parts.append(f"{sensor}: white noise of {seen} in motion, {told} told (SI units per √Hz).")
+            given, seen = number(noise.get("told"), 5), number(noise.get("typical"), 5)
+            parts.append(f"{sensor}: white noise of {seen} in motion, {given} given (SI units per √Hz).")
     parts += [f"{up_sentence(up)}."] if (up := as_dict(m, "up")) else []
     parts += _track_noise(as_dict(m, "track_noise"))
     source = run.manifest.get("source")
@@ -134,8 +134,8 @@ def _track_noise(noise: dict[str, Any]) -> list[str]:
     for name in ("graph", "filter"):
         pixel = as_dict(noise, name)
         if pixel:
-            used, told = number(pixel.get("used_px"), 2), number(pixel.get("told_px"), 2)
-            parts.append(f"the {name} goes by {used} px, {told} told")
+            used, given = number(pixel.get("used_px"), 2), number(pixel.get("told_px"), 2)
+            parts.append(f"the {name} uses {used} px, {given} given")
     return [f"Tracks scatter by {number(noise.get('measured_px'), 2)} px; {', '.join(parts)}."] if parts else []
 
 
@@ -257,7 +257,7 @@ def _trajectories(run: RunFiles, scene: Scene) -> str:
         card(plots.top_view(run, scene), title="From above"), card(plots.side_view(scene), title="From the side")
     )
     tilted = not scene.has_gravity and scene.truth is None and not as_dict(run.metrics, "up").get("direction")
-    text = "There is no IMU to tell what is up: z is that of the first camera." if tilted else ""
+    text = "There is no IMU to show what is up: z is that of the first camera." if tilted else ""
     return section("Trajectories", views, note(text) if text else "", kind="still of-map")
 
 

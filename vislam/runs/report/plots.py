@@ -38,7 +38,7 @@ def top_view(run: RunFiles, scene: Scene) -> str:
 
 
 def side_view(scene: Scene) -> str:
-    """Draw all trajectories from the side; the vertical scale is stretched where the motion is flat, and says so."""
+    """Draw all trajectories from the side; the vertical scale is stretched where the motion is flat."""
     positions = np.concatenate([t.positions_m for t in _all_paths(scene).values()])
     extent = np.ptp(positions, axis=0)
     along = 0 if extent[0] >= extent[1] else 1

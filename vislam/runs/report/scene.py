@@ -33,7 +33,7 @@ class ErrorCurve:
 class Scene:
     """Trajectories in one frame, aligned where there is a truth; times count from `zero_ns`.
 
-    The frame is the map (z up). Without an IMU nothing but the run's own word says that it is level, so then it is
+    The frame is the map (z up). Without an IMU nothing but the run's own estimate shows that it is level, so then it is
     the truth's.
     """
 

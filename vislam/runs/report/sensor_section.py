@@ -67,7 +67,7 @@ def _slipped(slip: dict[str, object]) -> str:
 
 
 def _in_graph(name: str, counted: dict[str, object]) -> list[str | Cell]:
-    """Return a row about a sensor; empty where nobody counted."""
+    """Return a row about a sensor; empty where nothing was counted."""
     if not counted:
         return []
     missing = sum(value for key in _NOT_THERE if isinstance(value := counted.get(key), int))

@@ -1,4 +1,4 @@
-"""What a run is worth, told without any truth: evidence in, a verdict with its reasons out."""
+"""What a run is worth, judged without any truth: evidence in, a verdict with its reasons out."""
 
 from vislam.runs.verdict.agreement import ForceAgreement, TurnAgreement, TurnStep, force_agreement, turn_agreement
 from vislam.runs.verdict.evidence import Apart, Evidence, Innovations, Moved

@@ -1,4 +1,4 @@
-"""Vision against inertial data, sensor against sensor: what each says of the same turns and the same speeding up.
+"""Vision against inertial data, sensor against sensor: what each measures of the same turns and accelerations.
 
 An estimator that fuses both hides where they disagree in its biases and residuals. Here the two are compared over the
 steps between keyframes by least squares, with the few unknowns that a wrong calibration would show in.
@@ -58,7 +58,7 @@ def turn_agreement(steps: Sequence[TurnStep]) -> TurnAgreement | None:
     """Compare turns; None where there are too few.
 
     A turn phi that vision sees differs from the gyroscope's by its bias, by a camera that stands otherwise on the body
-    than told, and by a factor: `e = J b + (R^T - 1) m + phi s`. All three are solved for; the factor is returned.
+    than given, and by a factor: `e = J b + (R^T - 1) m + phi s`. All three are solved for; the factor is returned.
     """
     if len(steps) < _MIN_STEPS:
         return None
@@ -122,7 +122,7 @@ def _dilution(one: Array, other: Array) -> float:
 
     Noise in what is multiplied draws a factor towards zero; multiplying the other one instead draws it the other way.
     The truth is between the two (Frisch 1934), which are 1 / r^2 apart, r the correlation: where nothing turns, or
-    nothing speeds up, only noise is left, and a factor says nothing.
+    nothing speeds up, only noise is left, and a factor is meaningless.
     """
     a, b = one - one.mean(axis=0), other - other.mean(axis=0)
     together = float(np.sum(a * b)) ** 2
@@ -131,7 +131,7 @@ def _dilution(one: Array, other: Array) -> float:
 
 
 def _robust(rows: Array, errors: Array, sigmas: Array, mean: Array, least: float) -> tuple[Array, Array, float]:
-    """Return solution [K], covariance [K, K] and the standard deviation of a row of [N, 3, K], which residuals tell."""
+    """Return solution [K], covariance [K, K] and the standard deviation of a row of [N, 3, K], from the residuals."""
     weights = np.ones(len(rows))
     x, P, spread = mean.copy(), np.diag(sigmas**2), least
     for _ in range(_ROUNDS):

@@ -16,14 +16,14 @@ Innovations = Mapping[str, tuple[int, float, int]]  # by kind: how many, the sum
 class Moved:
     """A number of the calibration as the run measured it."""
 
-    by: float  # since what was told
+    by: float  # from what was given
     sigma: float  # of that
 
     @staticmethod
     def measured(by: float, sigma: float, prior_sigma: float) -> Moved | None:
         """Return what was measured, for an estimate [by, sigma] that a prior around zero has drawn towards zero.
 
-        The prior says the same as what the verdict holds against the measurement; counted twice, it would hide it.
+        The prior states the same as what the verdict holds against the measurement; counted twice, it would hide it.
         None where hardly anything was measured.
         """
         known = 1.0 - (sigma / prior_sigma) ** 2
@@ -56,7 +56,7 @@ class Evidence:
     submaps_apart: int = 0  # submaps that no loop has joined with the first
     # how a live run kept up
     frames_offered: int = 0  # by the camera
-    frames_dropped: int = 0  # of them, that nobody took in time
+    frames_dropped: int = 0  # of them, that were not taken in time
     frames_left_out: int = 0  # of them, left out for want of time
     samples: int = 0
     samples_missed: int = 0  # inertial ones, that their rate would have brought

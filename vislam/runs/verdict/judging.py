@@ -36,13 +36,13 @@ _APART_SHARE = 0.005  # of the way: closer together than this they tell the same
 _MIN_FRAMES = 30  # before shares of them mean anything
 _MIN_LOOPS = 8
 _MIN_KEYFRAMES = 10
-_SOON_S = 0.05  # that things may wait, and nobody has to know
+_SOON_S = 0.05  # that things may wait without a remark
 _OWN_SHARE = 0.7  # of the time in which vision works that it has a core; below, other work has it
 _CALIBRATE = "run `vislam calibrate camera-imu`"
 
 
 class Trust(StrEnum):
-    """What a run is worth, as far as it can tell itself."""
+    """What a run is worth, as far as it can judge itself."""
 
     TRUSTED = "trusted"
     DOUBTFUL = "doubtful"
@@ -53,7 +53,7 @@ class Trust(StrEnum):
 class Verdict:
     """What a run is worth, why, and what it found out about its sensors.
 
-    `reasons` are empty of a run that is trusted. `moved` says what calibration found beyond its own sigmas: corrected,
+    `reasons` are empty of a run that is trusted. `moved` is what calibration found beyond its own sigmas: corrected,
     no doubt of itself.
     """
 
@@ -155,8 +155,8 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         )
     for name, count in e.regained.items():
         yield (
-            f"the filter refused readings of {name} until so many agreed that it moved to them, {count} times: it was "
-            "surer than it was right; look for stretches without sight, and for an IMU that is worse than told"
+            f"the filter refused readings of {name} until enough agreed that it moved to them, {count} times: it was "
+            "surer than it was right; look for stretches without sight, and for an IMU that is worse than stated"
         )
     if e.offered >= _MIN_FRAMES and e.refused > _REFUSED_SHARE * e.offered:
         yield f"the filter refused {e.refused} of {e.offered} visual measurements as impossible"
@@ -166,8 +166,8 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         independent = max(round(share * degrees), 1)
         if share * nis > chi_square_limit(c.probability, independent):
             yield (
-                f"innovations of {kind.replace('_', ' ')} are {nis / degrees:.1f} times what the noise that was told "
-                "explains: calibrate, or tell more noise"
+                f"innovations of {kind.replace('_', ' ')} are {nis / degrees:.1f} times what the stated noise "
+                "explains: calibrate, or state more noise"
             )
     if e.sigma_m > _SIGMA_M:
         yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst"
@@ -227,12 +227,12 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     if (period_s := 0.0 if e.rate_hz is None else 1.0 / e.rate_hz) > e.max_gap_s:
         yield (
             f"inertial samples come every {period_s:.2f} s and more than {e.max_gap_s:.2f} s is an outage: filter and "
-            "graph went without them, and without the readings between them; tell their rate in the IMU's sensor file "
+            "graph went without them, and without the readings between them; state their rate in the IMU's sensor file "
             "(3 Hz at least), or raise --imu.max-gap-s, --ekf.max-gap-s, --window.imu-max-gap-s and "
             "--graph.imu-max-gap-s"
         )
     elif off > _RATE_ERROR and not _misses_samples(e):
-        yield f"inertial samples come at {e.rate_hz:.0f} Hz, told were {e.rate_told_hz:.0f}: look for what loses them"
+        yield f"inertial samples come at {e.rate_hz:.0f} Hz, stated were {e.rate_told_hz:.0f}: look for what loses them"
     if e.longest_gap_s > max(e.max_gap_s, 1.5 * period_s):
         yield f"no inertial sample for {e.longest_gap_s:.2f} s: look at the cable, the bus and the load of the machine"
     if e.saturated:
@@ -250,16 +250,16 @@ _TESTS: tuple[Callable[[Evidence, VerdictConfig], Iterator[str]], ...] = (
 
 
 def _moved(e: Evidence, c: VerdictConfig) -> Iterator[str]:
-    """Tell what was estimated significantly off, though no farther than its kind usually is: it was corrected."""
+    """Report what was estimated significantly off, though no farther than its kind usually is: it was corrected."""
     if e.clock is not None and _beyond(e.clock, 0.0, 1, c) and not _beyond(e.clock, _CLOCK_SIGMA_S, 1, c):
-        yield f"{_clock_words(e.clock)}; corrected, --init.time-offset-s {e.clock.by:.4f} tells it from the start"
+        yield f"{_clock_words(e.clock)}; corrected, --init.time-offset-s {e.clock.by:.4f} sets it from the start"
     turn = e.rotation
     if turn is not None and _beyond(turn, 0.0, 3, c) and not _beyond(turn, c.rotation_sigma_deg, 3, c):
         yield f"the camera is turned by {turn.by:.2f} ± {turn.sigma:.2f} degrees against its file; corrected"
 
 
 def _beyond(moved: Moved, told_sigma: float, degrees: int, config: VerdictConfig) -> bool:
-    """Whether a number is farther off than its sigma and that of what was told explain."""
+    """Whether a number is farther off than its sigma and that of what was given explain."""
     if not math.isfinite(moved.by) or not math.isfinite(moved.sigma):
         return False
     variance = max(moved.sigma**2 + told_sigma**2, 1e-24)

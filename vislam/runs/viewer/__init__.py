@@ -32,7 +32,7 @@ __all__ = ["NullViewer", "open_viewer"]
 
 
 class NullViewer:
-    """The viewer of a run that nobody watches: every method of RunViewer, doing nothing."""
+    """The viewer of a run that is not watched: every method of RunViewer, doing nothing."""
 
     def __init__(self, reason: str = "off") -> None:
         """Remember why there is no viewer, so that a run can say it."""

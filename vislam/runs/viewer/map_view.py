@@ -1,6 +1,6 @@
 """The map as Rerun shows it: occupied voxels coloured by height, and the navigation grid at the floor.
 
-Both are sparse voxels of 16 bytes each, of which there are at most so many: larger maps are shown coarser.
+Both are sparse voxels of 16 bytes each, in a bounded number: larger maps are shown coarser.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ _JPEG_QUALITY = 75
 _MAX_RANGE_M = 8.0  # farther depth is noise that hides the scene
 
 
-rr.unregister_shutdown()  # at exit it waits without a limit; whoever opens a recording closes it
+rr.unregister_shutdown()  # at exit it waits without a limit; who opens a recording closes it
 
 _PAPER_GREY = 60
 _COLORS = {
@@ -59,7 +59,7 @@ _OTHER_COLOR = (150, 110, 190)
 _TRACKING_COLORS = {Tracking.OK: 0x27A05AFF, Tracking.DEGRADED: 0xE0A030FF, Tracking.LOST: 0xC84646FF}
 _CAMERA = "world/live/cam0"
 _PIECE = 64  # poses per line piece
-_PIECE_STEP = 4  # a growing piece is written again after so many poses
+_PIECE_STEP = 4  # poses after which a growing piece is written again
 _MOVED_M = 2e-3  # smaller moves cannot be seen
 _MOVED_RAD = np.deg2rad(0.1)
 _STILL_S = 3.0  # without progress, until the file is given up
