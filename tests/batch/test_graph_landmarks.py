@@ -208,7 +208,7 @@ INDEFINITE += ["EDGE_SE2 0 1 1 0 0 1 2 0 1 0 5", "EDGE_SE2 1 2 1 0 0 1 0 0 2 3 1
 
 
 def test_indefinite_information_is_projected_when_asked(tmp_path):
-    with pytest.raises(DataError, match=r"graph.g2o:5: .* -1, and 2 of 3 edges are so; --repair-information"):
+    with pytest.raises(DataError, match=r"graph.g2o:5: .* -1; so are 2 of 3 edges; --repair-information"):
         read(tmp_path, *INDEFINITE)
     problem = read(tmp_path, *INDEFINITE, repair=True)
     assert any("2 of 3 edges was not positive (the first: line 5" in note for note in problem.notes)

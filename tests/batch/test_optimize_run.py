@@ -75,8 +75,8 @@ def test_a_false_loop_that_the_run_had_accepted_is_refused_and_named():
     (verdict,) = result.loops
     assert verdict.in_run
     assert not verdict.kept
-    assert "cannot tell" in verdict.reason
-    assert "cannot tell" in result.note
+    assert "undecided" in verdict.reason
+    assert "undecided" in result.note
 
 
 @pytest.mark.parametrize("true_loops", [1, 2])

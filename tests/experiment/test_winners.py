@@ -34,7 +34,7 @@ def test_no_difference_has_no_winner_and_says_between_whom():
     (winner,) = of_plan(compare(noisy, "ate_m"))
     assert winner.estimate == ""
     assert math.isnan(winner.margin)
-    assert "a filter, causal and b filter, causal cannot be told apart (p 0." in told(winner)
+    assert "a filter, causal and b filter, causal cannot be distinguished (p 0." in told(winner)
 
 
 def test_with_few_pairs_nobody_can_win():

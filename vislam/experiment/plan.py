@@ -183,7 +183,7 @@ def _placed(estimator: Estimator, where: str, folder: Path, variables: Mapping[s
 
 
 def _fitting(estimator: Estimator, sequences: Iterable[Sequence], where: str) -> Estimator:
-    """Return a peer with the sequences that it can read, unless the plan lists its own; any other estimator as it is."""
+    """Return a peer with the sequences that it can read, unless the plan lists its own; another estimator as it is."""
     if not estimator.peer or estimator.sequences:
         return estimator
     modes = ("auto", *peers.PEERS[estimator.peer.partition("=")[0]].modes)

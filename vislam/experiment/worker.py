@@ -1,6 +1,6 @@
 """One job in a process of its own: `python -m vislam.experiment.worker FOLDER`, from request.json to result.json.
 
-Standard input is a pipe that nothing is written to: when it closes, the parent is gone, and nothing is left to work for.
+Standard input is a pipe that nothing is written to: when it closes, the parent is gone, and the worker ends.
 """
 
 from __future__ import annotations

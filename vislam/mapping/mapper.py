@@ -78,7 +78,7 @@ class Mapper:
         return self._occupancy.occupancy
 
     def snapshot(self) -> Octree:
-        """Return a copy of the occupancy map for other threads, which nothing changes and for which nobody waits.
+        """Return a copy of the occupancy map for other threads, which nothing changes and for which no thread waits.
 
         The thread that feeds the mapper calls this and hands the copy on.
         """
@@ -220,7 +220,7 @@ class Mapper:
         return self._labels.layer(self._occupancy.poses, self._store, self._extractor.view, self.occupancy)
 
     def turned(self, T: Array) -> Mapper:
-        """Return a map of the same keyframes with all poses moved by T [4, 4], made anew: voxels cannot be turned."""
+        """Return a map of the same keyframes with all poses moved by T [4, 4], rebuilt: voxels cannot be turned."""
         if np.array_equal(T, np.eye(4)):
             return self
         poses = {i: T @ pose for i, pose in sorted((self._occupancy.poses | self._apart).items())}
@@ -232,7 +232,7 @@ class Mapper:
         It is where a surface is among the products. What was found is in `refinement`. Keyframes of submaps that are
         not joined with the map stay where they are.
         """
-        # the noise of depth that it goes by is that of a depth sensor
+        # the noise of depth that it assumes is that of a depth sensor
         is_asked = self._config.refine_poses and not set(SURFACES).isdisjoint(self._config.products)
         if not is_asked or not self._rig.has_depth or self._one_camera:
             return self
@@ -256,8 +256,8 @@ class Mapper:
         """Write the configured products of the map; return what was written, and note what could not be.
 
         Keyframes of submaps that are not joined with the map get one of their own, in a folder `submap_N`. Each file is
-        replaced whole. Where z may not be up, `not_level` says why, and grids are left out. `step` is told the name of
-        each product before it is made. Raises StorageError when one cannot be written.
+        replaced whole. Where z may not be up, `not_level` is the reason, and grids are left out. `step` is called
+        with the name of each product before it is made. Raises StorageError when one cannot be written.
         """
         written, self.notes = write_products(self, folder, self._config, step, not_level.map)
         layers = self._layers()

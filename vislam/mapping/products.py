@@ -103,8 +103,8 @@ def write_products(
 
     Labels are written where the map has some.
 
-    Where z of the map may not be up, `not_level` says why: what needs that is removed, if it is there, and not written.
-    `step` is told each configured product before it is made.
+    Where z of the map may not be up, `not_level` is the reason: products that need it are removed and not written.
+    `step` is called with each configured product before it is made.
 
     Raises StorageError when one cannot be written.
     """

@@ -28,7 +28,7 @@ class MapStage:
     ) -> None:
         """Prepare for a rig; with `one_camera` depth comes from frames between keyframes.
 
-        `labeller` tells the labels of keyframes; None: the folder of label images in the settings, if there is one.
+        `labeller` gives the labels of keyframes; None: the folder of label images in the settings, if there is one.
         Raises DataError when settings and rig cannot make a map, or the label images cannot be used.
         """
         if labeller is None and config.labels.folder is not None:

@@ -26,7 +26,7 @@ class InertialSource(Protocol):
         ...
 
     def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
-        """Return gyro and accelerometer biases [N, 3] at times [N]; NaN where nobody knows them."""
+        """Return gyro and accelerometer biases [N, 3] at times [N]; NaN where they are unknown."""
         ...
 
 
@@ -45,7 +45,7 @@ class RecordedImu:
             yield ImuSample(t_ns, gyro, accel)
 
     def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
-        """Return NaN: a real IMU does not tell."""
+        """Return NaN: they are unknown of a real IMU."""
         return np.full((len(t_ns), 3), np.nan), np.full((len(t_ns), 3), np.nan)
 
 

@@ -71,7 +71,7 @@ class BatchResult:
 
 
 def optimize_run(log: FactorLog, config: Config, suite: Suite | None = None) -> BatchResult:
-    """Estimate a run anew from its factor log; deterministic. Readings of the sensors in `suite` are factors, too.
+    """Estimate a run again from its factor log; deterministic. Readings of the sensors in `suite` are factors, too.
 
     Raises DataError when the log cannot be used or no solver finds a solution.
     """
@@ -139,7 +139,7 @@ class _Batch:
         return np.asarray(self._poses() @ self._T_body_cam0)
 
     def _judge(self, first: bool) -> None:
-        """Triangulate every track anew and decide which observations and depths count.
+        """Triangulate every track again and decide which observations and depths count.
 
         In the first round poses are the run's: what is grossly off leaves, the worst of a track before the rest is
         triangulated again.
@@ -302,7 +302,7 @@ class _Batch:
 
 
 def _bounded(tracks: Tracks, keep: Mask, most: int) -> Mask:
-    """Return at most so many observations, those of the longest tracks."""
+    """Return at most `most` observations, those of the longest tracks."""
     counts = tracks.counts(keep)
     order = np.argsort(-counts, kind="stable")
     chosen = np.zeros(tracks.points, dtype=bool)

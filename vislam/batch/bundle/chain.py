@@ -59,7 +59,7 @@ class Chain:
         odom = np.array([_rigid(k.T_odom_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
         self._odometry = np.array([invert(a) @ b for a, b in pairwise(odom)]).reshape(-1, 4, 4)
         if not self.has_imu and any(not r.has_scale for r in self.records[1:]):
-            raise DataError("the run is of one camera without an IMU: nothing in it tells scale")
+            raise DataError("the run is of one camera without an IMU: nothing in it shows scale")
         self._log = log
 
     def initial(self) -> gtsam.Values:
@@ -188,7 +188,7 @@ class Chain:
 
 
 def _duration_s(before: KeyframeRecord, record: KeyframeRecord) -> float:
-    """Return the seconds between two keyframes; before a new submap, whose clock may have begun anew, at least one."""
+    """Return the seconds between two keyframes; before a new submap, whose clock may begin again, at least one."""
     duration_s = (record.t_ns - before.t_ns) * 1e-9
     return max(duration_s, 1.0) if record.begins_submap else duration_s
 

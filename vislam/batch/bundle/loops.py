@@ -74,7 +74,7 @@ class Loops:
             kept = bool(decided.weights[e] > 0.0)
             reason = "agrees with odometry and the other loops" if kept else "contradicts odometry or the other loops"
             if e in undecided:
-                reason = "cannot tell: too little speaks for it or against it"
+                reason = "undecided: too little speaks for it or against it"
             self._judge(record, kept, reason)
             if kept:
                 self.kept.append(record)

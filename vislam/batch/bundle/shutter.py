@@ -11,7 +11,7 @@ from vislam.core.messages import Array
 from vislam.trajectory import Trajectory
 
 _HALF_WINDOW_NS = 50_000_000  # velocity is the motion between this long before and after
-_MIN_SEEN = 20  # observations of a keyframe that may tell the readout: six go to its pose
+_MIN_SEEN = 20  # observations of a keyframe that may show the readout: six go to its pose
 _MAX_S = 0.05
 _FIRST_GAIN = 0.5  # share of an error of the readout that residuals show, points having taken the rest
 _MIN_GAIN = 0.2  # a smaller share would be extrapolated from noise
@@ -20,7 +20,7 @@ _MIN_GAIN = 0.2  # a smaller share would be extrapolated from noise
 class ReadoutSearch:
     """Finds the readout that leaves no shear: points bend to hide most of it, so plain steps would take many rounds.
 
-    What is left to see is a share of the true error; two rounds tell which share, as in the secant method.
+    What is left to see is a share of the true error; two rounds show which share, as in the secant method.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Which loops of a pose graph to believe, when nobody says by which method: several are tried, evidence decides.
+"""Which loops of a pose graph to believe, without a given method: several are tried, evidence decides.
 
 Robust kernels of several shapes and scales, and gates that let loops in one by one, lead from odometry to solutions in
 different places. Each is settled by `Judge`, which lets loops in and takes them back until all agree, and they are
@@ -29,7 +29,7 @@ from vislam.core.messages import Array
 
 Mask = NDArray[np.bool_]
 
-# the loops' chi2 at odometry of which quantile is the first scale: from the few that odometry tells, or from many
+# the loops' chi2 at odometry of which quantile is the first scale: from the few that odometry can judge, or from many
 _ROUTES: tuple[tuple[Kernel, float], ...] = (
     ("geman-mcclure", 0.05), ("dcs", 0.2), ("dcs", 0.05), ("geman-mcclure", 0.2), ("geman-mcclure", 0.02),
 )  # fmt: skip
@@ -90,7 +90,7 @@ def _decide(problem: PoseGraphProblem, config: PoseGraphConfig, progress: Progre
     held = int(best.kept[loops].sum())
     if held == 0 or gain < _GAIN_MIN:
         warning = (
-            f"cannot tell which of the {len(loops)} loops are true: none is believed, odometry alone is the answer"
+            f"it is undecided which of the {len(loops)} loops are true: none is believed, odometry alone is the answer"
         )
         return Decision(odometry, trusted.astype(np.float64), "odometry alone", loops, warning)
     kept, poses = best.kept.copy(), best.poses
@@ -223,7 +223,7 @@ def _warning(problem: PoseGraphProblem, disputed: Mask, thin: Mask) -> str:
     more = int(cluster.max()) + 1 - len(names)
     why = "other loops contradict them as well as they agree" if disputed.any() else "nothing else confirms them"
     return (
-        f"cannot tell whether {len(at)} loops are true, {why}; left out, poses "
+        f"it is undecided whether {len(at)} loops are true, {why}; left out, poses "
         + ", ".join(names)
         + (f" and {more} more" if more > 0 else "")
         + "; loops between these places seen at other times, or smaller stated noise of odometry, would decide"

@@ -97,7 +97,7 @@ class Extras:
         )
 
     def marked(self, problem: PoseGraphProblem) -> PoseGraphProblem:
-        """Return a problem of what `joined` gave, with its landmarks, positions and world told."""
+        """Return a problem of what `joined` gave, with its landmarks, positions and world frame as given."""
         own = len(problem.edges) - len(self.lines)
         is_position = np.concatenate([np.zeros(own, dtype=np.bool_), self.is_position])
         information, turn = problem.information.copy(), problem.tangent - problem.dimension
@@ -201,7 +201,7 @@ def _positions(rows: Rows, observed: bool, wants_point: bool) -> _Columns:
 def _priors_2d(rows: Rows) -> _Columns:
     Z = poses_from_angles(rows.numbers[:, :2], rows.numbers[:, 2])
     W = symmetric(rows.numbers[:, 3:], _ORDER_2D)
-    return _priors(rows, Z, W, _says_nothing(W[:, :1]))
+    return _priors(rows, Z, W, _is_empty(W[:, :1]))
 
 
 def _priors_3d(path: Path, rows: Rows, offsets: dict[int, Array]) -> _Columns:
@@ -211,8 +211,8 @@ def _priors_3d(path: Path, rows: Rows, offsets: dict[int, Array]) -> _Columns:
     A = np.zeros((len(back), 6, 6))  # adjoints of P^-1, rotation first
     A[:, :3, :3] = A[:, 3:, 3:] = back[:, :3, :3]
     A[:, 3:, :3] = np.cross(back[:, None, :3, 3], back[:, :3, :3], axisa=2, axisb=1, axisc=1)
-    told = _priors(rows, Z @ back, A.transpose(0, 2, 1) @ W @ A, _says_nothing(W[:, :3]))
-    levers = told["is_position"]
+    priors = _priors(rows, Z @ back, A.transpose(0, 2, 1) @ W @ A, _is_empty(W[:, :3]))
+    levers = priors["is_position"]
     moved = levers & back[:, :3, 3].any(axis=1)
     if moved.any():
         line = rows.lines[int(np.argmax(moved))]
@@ -220,8 +220,8 @@ def _priors_3d(path: Path, rows: Rows, offsets: dict[int, Array]) -> _Columns:
             f"{path}:{line}: a prior of a position alone, with an offset away from the body, is not known here; give "
             "it information on the rotation, or an offset at the body's origin"
         )
-    told["information"][levers, :3] = told["information"][levers, :, :3] = 0.0
-    return told
+    priors["information"][levers, :3] = priors["information"][levers, :, :3] = 0.0
+    return priors
 
 
 def _priors(rows: Rows, Z: Array, W: Array, is_position: Mask) -> _Columns:
@@ -233,7 +233,7 @@ def _priors(rows: Rows, Z: Array, W: Array, is_position: Mask) -> _Columns:
     }  # fmt: skip
 
 
-def _says_nothing(rows: Array) -> Mask:
+def _is_empty(rows: Array) -> Mask:
     """Return which [M] of some rows [M, r, k] of matrices are zero."""
     return np.array([not W.any() for W in rows], dtype=np.bool_)
 

@@ -33,9 +33,9 @@ _LOOKED_AT_BYTES = 1 << 20
 
 
 def graph_format(path: Path) -> GraphFormat:
-    """Return the format of a file by its ending .g2o, .toro or .isam, else by the first telling line in its first MiB.
+    """Return the format of a file by its ending .g2o, .toro or .isam, else by a line in its first MiB that shows it.
 
-    Raises UsageError where neither tells: EDGE2 and EDGE3 alone mean one thing to TORO and another one to iSAM.
+    Raises UsageError where neither decides: EDGE2 and EDGE3 alone mean one thing to TORO and another one to iSAM.
     """
     by_name = _ENDINGS.get(path.suffix.lower())
     if by_name is not None:
@@ -50,19 +50,19 @@ def graph_format(path: Path) -> GraphFormat:
         if tag and (found := _TAGS.get(tag[0].decode("utf-8", errors="replace"))) is not None:
             return found
     raise UsageError(
-        f"{path}: neither name nor contents tell g2o, TORO and iSAM apart; end the name in .g2o, .toro or .isam"
+        f"{path}: neither name nor contents decide between g2o, TORO and iSAM; end the name in .g2o, .toro or .isam"
     )
 
 
 def read_pose_graph(path: Path, repair: bool = False, isam_noise: Noise | Literal["auto"] = "auto") -> PoseGraphProblem:
     """Read a pose graph of any format; see `graph_format` and the readers. `repair`: make its information positive.
 
-    `isam_noise`: whether an iSAM file in the plane states square roots of information or covariances; "auto" tells.
+    `isam_noise`: whether an iSAM file in the plane states square roots of information or covariances; "auto" decides.
     """
     name = graph_format(path)
     return read_isam(path, repair, isam_noise) if name == "isam" else _READERS[name](path, repair)
 
 
 def write_pose_graph(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
-    """Write a pose graph in the format that the name ends in, g2o where it tells none; see the writers."""
+    """Write a pose graph in the format that the name ends in, g2o where it has none; see the writers."""
     _WRITERS[_ENDINGS.get(path.suffix.lower(), "g2o")](problem, path, poses)

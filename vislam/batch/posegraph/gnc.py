@@ -1,8 +1,8 @@
 """Which loops of a pose graph are false: gates that narrow as loops are taken, then graduated non-convexity.
 
 Graduated non-convexity alone, from odometry that drifted far, ends with false loops kept: the true ones pull as weakly
-at first as the false ones. So loops enter first that odometry can tell, in the order of their evidence: each must pass
-a chi-square gate of its innovation, and be far likelier true than a false loop, which may say anything in the space of
+at first as the false ones. So loops enter first that odometry can judge, in the order of their evidence: each must pass
+a chi-square gate of its innovation, and be far likelier true than a false loop, which may be anything in the space of
 the trajectory. Every loop taken narrows the gates of the others.
 """
 
@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 _EVIDENCE = (16.0, 12.0, 9.0, 6.0, 4.0)  # log-odds of a loop that enters; lower ones once there is nothing above
 _ROUNDS_MAX = 60
 _CLOSEST = 0.1  # of the loops, taken as the closest fifth of true ones when half of all are false
-_LOOPS_FOR_SCALE = 30  # from which on the cost per degree of freedom tells the scale
+_LOOPS_FOR_SCALE = 30  # from which on the cost per degree of freedom shows the scale
 _SCALE_MIN = 1e-10
 _INNER_TOLERANCE = 1e-6
 _GROWTH = 1.4  # of the control parameter of graduated non-convexity per step, as in the paper
@@ -87,7 +87,7 @@ def _gated(
 ) -> tuple[Array, Mask, float]:
     """Return poses by the edges that passed the gates, these edges with others not far off, and the noise's scale.
 
-    Many files state variances that are far too large, by which nothing could be told from anything. So all variances
+    Many files state variances that are far too large, which would separate nothing. So all variances
     are multiplied by what the agreement of loops with odometry shows, and later the cost per degree of freedom; never
     by more than 1.
     """

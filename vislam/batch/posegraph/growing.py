@@ -19,7 +19,7 @@ from vislam.batch.posegraph.structure import Structure
 from vislam.core.messages import Array
 
 _FIRST = 20  # poses of the first stretch
-_SHARE = 10  # a stretch has one for so many that are there
+_SHARE = 10  # a stretch has one for each `_SHARE` that are there
 _ITERATIONS, _TOLERANCE = 3, 1e-2  # of a stretch; the next one asks something else anyway
 
 # of part of a problem, its poses, which edges [M] it has: better poses and weights [M]
@@ -29,7 +29,7 @@ Reweigh = Callable[[PoseGraphProblem, Array, Ids], tuple[Array, Array]]
 def grown_start(problem: PoseGraphProblem, reweigh: Reweigh | None = None) -> Array:
     """Return poses [N, d + 1, d + 1] that grew from the first one, each stretch optimised with all before it.
 
-    `reweigh` gives the weights of the edges before each round, 1 without it, and may place landmarks anew. Poses of
+    `reweigh` gives the weights of the edges before each round, 1 without it, and may place landmarks again. Poses of
     another part of the graph than the first come last.
     """
     poses = np.full_like(problem.poses, np.nan)
@@ -46,7 +46,7 @@ def grown_start(problem: PoseGraphProblem, reweigh: Reweigh | None = None) -> Ar
 def _with_more(
     problem: PoseGraphProblem, poses: Array, there: int, when: tuple[Ids, Ids], reweigh: Reweigh | None
 ) -> Array:
-    """Return the poses with so many `there`, settled; those that nothing joins to them yet wait."""
+    """Return the poses with those `there`, settled; those that nothing joins to them yet wait."""
     rank, arrives = when
     edges = np.flatnonzero(arrives < there)
     last = there == int(problem.is_pose.sum())

@@ -120,7 +120,7 @@ def _replayed(
 
 
 def _from_edge(problem: PoseGraphProblem, isam: gtsam.ISAM2, i: int, edges: list[int]) -> Array | None:
-    """Return where the first of the edges that tells it puts a pose or landmark, None where none does."""
+    """Return where the first of the edges that has it puts a pose or landmark, None where none does."""
     for e in edges:
         a, b = problem.edges[e].tolist()
         if problem.is_position[e] and not problem.is_point[i]:

@@ -6,7 +6,7 @@ Information is carried into our tangent at the measurement and back, so that bot
 pitch of 90 degrees Euler angles have no rates, and such an edge is refused.
 
 Files go about in this format whose numbers are covariances (Victoria Park as gtsam brings it). Taken for square roots,
-their headings would be off by more than half a turn, which says nothing: by that they are told.
+their headings would be off by more than half a turn, which is meaningless: that identifies them.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def read_isam(path: Path, repair: bool = False, noise: Noise | Literal["auto"] =
     """Read ODOMETRY, EDGE2, Constraint2, LANDMARK and BR, or EDGE3 and POSE3D_INIT.
 
     There are no poses of the plane to start from. Edges are in the order of the file, landmarks behind them. `noise`
-    says what stands for it in the plane: the square root of information, as in iSAM, or covariances; "auto" tells.
+    is what stands for it in the plane: the square root of information, as in iSAM, or covariances; "auto" decides.
     Raises DataError with the line number on damage of any kind, on both dimensions in one file, on other tags and on an
     id of a landmark that is a pose's too; see `problem_from_lines` for the rest.
     """
@@ -91,11 +91,11 @@ def _form(edges: Rows, noise: Noise | Literal["auto"]) -> tuple[Noise, tuple[str
     root = float(np.median(edges.numbers[:, -1])) if len(edges.lines) else 0.0
     if not 0.0 < root < 1.0 / np.pi:
         return "root", ()
-    told = (
+    note = (
         f"the noise was read as covariances (headings to {np.sqrt(root):.2g} rad): as square roots of information, "
-        f"headings would be off by {1.0 / root:.2g} rad, which says nothing; --isam-noise root reads them so"
+        f"headings would be off by {1.0 / root:.2g} rad, which is meaningless; --isam-noise root reads them so"
     )
-    return "covariance", (told,)
+    return "covariance", (note,)
 
 
 def _squared(path: Path, edges: Rows, J: Array) -> Array:

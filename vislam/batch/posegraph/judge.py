@@ -36,8 +36,8 @@ _WORST = 0.3  # of the worst score: the loops that leave with it; a bad one make
 _ODDS = math.log(3.0)  # a loop is believed that is three times likelier true than false: a false one harms more
 _BACK = 2.0  # log-odds more for every time that it was taken back
 _BORDER = 1.0  # log-odds: covariances of loops nearer to a decision are computed in every round
-_CHANGED = 0.05  # of the loops kept: so many changes, and those of all are
-_SAMPLE = 150  # edges of each kind whose covariances tell the scales
+_CHANGED = 0.05  # of the loops kept: as many changes, and those of all are
+_SAMPLE = 150  # edges of each kind whose covariances show the scales
 _CALIBRATIONS = 4
 _SETTLED = 0.2  # of the logarithm of a scale
 _SCALE_MIN, _ODOMETRY_SCALE_MAX, _LOOP_SCALE_MAX = 1e-10, 4.0, 1.0
@@ -60,7 +60,7 @@ class Judgement:
     loop_scale: float
     objective: float  # minus twice the logarithm of the marginal likelihood: lower explains more
     evidence: Array  # [E] log-odds that an edge is true; inf of those trusted
-    leverage: Array  # [E] share of a kept loop in what it says: near 1 nothing else confirms it; 0 of those left out
+    leverage: Array  # [E] share of a kept loop in its own estimate: near 1 nothing else confirms it; 0: left out
 
 
 class Judge:

@@ -37,13 +37,13 @@ class NoiseOfKind:
     numbers: int  # measured ones, those without information not counted
     chi2: float
     redundancy: float  # degrees of freedom
-    factor: float  # variances are this many times those stated; nan where the redundancy is too small to tell
+    factor: float  # variances are this many times those stated; nan where the redundancy is too small for it
     applied: float  # the factor that variances were multiplied by, 1 without --rescale-noise
 
     @property
     def text(self) -> str:
         """Return the finding in one line."""
-        found = "too few to tell" if np.isnan(self.factor) else f"{self.factor:.3g}"
+        found = "too few" if np.isnan(self.factor) else f"{self.factor:.3g}"
         scaled = "" if self.applied == 1.0 else f", variances multiplied by {self.applied:.3g}"
         return (
             f"{self.kind}: chi2 {self.chi2:.6g} over {self.redundancy:.6g} degrees of freedom ({self.numbers} numbers "
@@ -122,14 +122,14 @@ def noise_of_kinds(problem: PoseGraphProblem, poses: Array, weights: Array | Non
                 continue
             total = times * max(float(chi2[of_kind, columns].sum()), 0.0)
             redundancy = max(numbers - times * float(taken[of_kind, columns].sum()), 0.0)
-            tells = redundancy >= max(_REDUNDANCY_MIN, _SHARE_MIN * numbers)
-            factor = max(total / redundancy, _TINY) if tells else float("nan")
+            is_enough = redundancy >= max(_REDUNDANCY_MIN, _SHARE_MIN * numbers)
+            factor = max(total / redundancy, _TINY) if is_enough else float("nan")
             found.append(NoiseOfKind(f"{name} {part}", edges, numbers, total, redundancy, factor, 1.0))
     return tuple(found)
 
 
 def rescaled(problem: PoseGraphProblem, noise: tuple[NoiseOfKind, ...]) -> PoseGraphProblem:
-    """Return the problem with variances multiplied by what each kind's residuals show, where they tell."""
+    """Return the problem with variances multiplied by what each kind's residuals show, where they are enough."""
     factors = {kind.kind: kind.factor for kind in noise if np.isfinite(kind.factor)}
     odometry = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
     scale, turn = np.ones((len(problem.edges), problem.tangent)), problem.tangent - problem.dimension
@@ -140,5 +140,5 @@ def rescaled(problem: PoseGraphProblem, noise: tuple[NoiseOfKind, ...]) -> PoseG
 
 
 def spread_out(edges: Ids, most: int) -> Ids:
-    """Return at most so many of the edges, at equal distances."""
+    """Return at most `most` of the edges, at equal distances."""
     return edges if len(edges) <= most else edges[np.linspace(0, len(edges) - 1, most).astype(np.int64)]

@@ -38,7 +38,7 @@ class PoseGraphSolution:
     notes: tuple[str, ...]
     solve_s: float  # process time
     robust_reason: str = ""  # why these edges were kept
-    undecided: tuple[int, ...] = ()  # edges left out because nothing tells whether they are true
+    undecided: tuple[int, ...] = ()  # edges left out because it is undecided whether they are true
 
     def __repr__(self) -> str:
         end = "converged" if self.converged else "not converged"
@@ -106,7 +106,7 @@ def as_stated(problem: PoseGraphProblem, weights: NDArray[np.float64]) -> tuple[
 
 
 def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress | None) -> Decision:
-    """Return what the route that was asked for says about the edges."""
+    """Return what the route that was asked for finds of the edges."""
     if not structure.problem.of_poses:
         return reject_false_sightings(structure.problem, config, progress)
     if config.robust == "auto":
@@ -117,7 +117,7 @@ def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress 
 
 
 def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> list[str]:
-    """Return what is to be told of landmarks."""
+    """Return what is to be reported of landmarks."""
     if not problem.is_point.any():
         return []
     free = undetermined_landmarks(problem, poses, weights)

@@ -18,7 +18,7 @@ _FARTHEST_M = 1e15  # beyond, a double knows no metre
 _INFORMATION = (
     1e-24,
     1e24,
-)  # largest entry, 1/rad^2, 1/m^2: what is outside says nothing, or more than can be known
+)  # largest entry, 1/rad^2, 1/m^2: what is outside is meaningless, or more than can be known
 _REPAIRED = 1e-9  # of the largest eigenvalue: least of a repaired matrix
 _NEGATIVE = 1e-6  # of the largest eigenvalue: what files' rounding makes of a zero one
 
@@ -92,7 +92,7 @@ def problem_from_lines(
     """Return the checked problem; `fixed_ids` are (line, id). With `repair` negative information is made positive.
 
     A pose that only edges name has no initial value. A pose that is given twice alike counts once, several edges
-    between two poses all count; `notes` tell. Raises DataError with the line for a pose given twice with different
+    between two poses all count; `notes` state it. Raises DataError with the line for a pose given twice with different
     values, an edge from a pose to itself, information that is negative or zero, and a fixed pose that is none.
     """
     notes: list[str] = []
@@ -182,7 +182,7 @@ def _with_sound_information(path: Path, edges: EdgeLines, repair: bool, notes: l
     """Return edges whose information is positive semidefinite. Raises DataError for others, unless they are repaired.
 
     Repaired is by the nearest matrix, in Frobenius' norm, without eigenvalues below a billionth of the largest (Higham,
-    "Computing a nearest symmetric positive semidefinite matrix", 1988). What says nothing cannot be repaired.
+    "Computing a nearest symmetric positive semidefinite matrix", 1988). Information of zero cannot be repaired.
     """
     wrong, eigenvalues = _indefinite(edges.information)
     if not len(wrong):
@@ -191,18 +191,18 @@ def _with_sound_information(path: Path, edges: EdgeLines, repair: bool, notes: l
     first = int(empty[0]) if repair and len(empty) else 0
     where, least = f"{path}:{edges.lines[wrong[first]]}", eigenvalues[first, 0]
     if not edges.information[wrong[first]].any():
-        raise DataError(f"{where}: the information is zero: the edge says nothing; remove the line")
-    told = f"its smallest eigenvalue is {least:.4g}"
+        raise DataError(f"{where}: the information is zero: the edge has no effect; remove the line")
+    least_is = f"its smallest eigenvalue is {least:.4g}"
     if repair and len(empty):
-        raise DataError(f"{where}: the information is not positive in any direction: {told}; remove the line")
+        raise DataError(f"{where}: the information is not positive in any direction: {least_is}; remove the line")
     if not repair:
         raise DataError(
-            f"{where}: the information is not positive: {told}, and {len(wrong)} of {len(edges.lines)} edges are so; "
+            f"{where}: the information is not positive: {least_is}; so are {len(wrong)} of {len(edges.lines)} edges; "
             "--repair-information takes the nearest positive ones"
         )
     notes.append(
         f"the information of {len(wrong)} of {len(edges.lines)} edges was not positive (the first: line "
-        f"{edges.lines[wrong[0]]}, {told}); the nearest positive definite one was taken"
+        f"{edges.lines[wrong[0]]}, {least_is}); the nearest positive definite one was taken"
     )
     values, vectors = np.linalg.eigh(edges.information[wrong])
     values = np.maximum(values, _REPAIRED * values[:, -1:])

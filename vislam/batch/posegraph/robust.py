@@ -48,7 +48,7 @@ def kernel_route(
 ) -> tuple[Array, Array] | None:
     """Return poses [N, d + 1, d + 1] under the kernel and the weights [E] of the edges; those trusted [E] have 1.
 
-    With `give_up`, None where so many loops count that their factor is dear: few that agree do not fill it.
+    With `give_up`, None where too many loops count for their factor to be cheap: few that agree do not fill it.
     `poses` is where to start; `first_scale` is the chi2 of loops that still count there, KERNEL_CHI2 at least.
     """
     weights = np.ones(len(problem.edges))

@@ -21,7 +21,7 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import UsageError
 from vislam.core.messages import Array
 
-_CONSENSUS_MIN = 3  # sightings; of two nothing tells which one is false
+_CONSENSUS_MIN = 3  # sightings; of two it is undecidable which one is false
 _TRIED = 64  # of a landmark's sightings, spread evenly over time
 _UNKNOWN = 1e-9  # of the largest eigenvalue of what is known of a landmark: a direction that nothing measures
 
@@ -56,7 +56,7 @@ def reject_false_sightings(
 def with_landmarks_by_consensus(problem: PoseGraphProblem, poses: Array) -> Array:
     """Return poses [N, d + 1, d + 1] with landmarks where one of their sightings puts them, if others agree more there.
 
-    Cauchy's cost says how far they agree. Without it a landmark whose first sighting is false stays with that one: the
+    Cauchy's cost weighs their agreement. Without it a landmark whose first sighting is false stays with that one: the
     true ones, far away, hardly pull.
     """
     d = problem.dimension
@@ -109,7 +109,7 @@ def undetermined_message(ids: Ids) -> str:
     """Return a sentence on landmarks that are undetermined."""
     return (
         f"{len(ids)} landmarks are seen along one direction only, as by range or bearing alone from one place (the "
-        f"first: {ids[0]}); where they are across it, nothing tells; see them from elsewhere or remove their lines"
+        f"first: {ids[0]}); where they are across it is undetermined; see them from elsewhere or remove their lines"
     )
 
 

@@ -148,7 +148,7 @@ def _fronts(  # noqa: PLR0912, PLR0915
     begin, count = np.empty(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     space = np.empty(4 * n + len(neighbours), dtype=np.int64)
     free = 0
-    first, top = np.empty(n + 1, dtype=np.int64), 0  # the fronts so far; their last columns tell the rows
+    first, top = np.empty(n + 1, dtype=np.int64), 0  # the fronts so far; their last columns give the rows
     zeros = np.zeros(n + 1, dtype=np.int64)
     for k in range(n):
         seen[k] = k

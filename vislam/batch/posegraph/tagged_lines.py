@@ -61,7 +61,7 @@ class TaggedLines:
 def read_tagged_lines(path: Path, columns: Mapping[str, tuple[int, int]]) -> TaggedLines:
     """Read a file of lines `TAG id ... number ...`; empty lines and those that begin with # are skipped.
 
-    `columns` says for each tag how many ids (0 to 2^63 - 1) and how many numbers follow. Raises DataError with the line
+    `columns` has for each tag how many ids (0 to 2^63 - 1) and how many numbers follow. Raises DataError with the line
     number where a line is cut short or has too much, on what is no number, on NaN and on infinity.
     """
     text = _read(path)

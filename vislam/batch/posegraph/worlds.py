@@ -160,7 +160,7 @@ def _near_pairs(positions: Array, wanted: int, rng: np.random.Generator) -> Ids:
 
 
 def _false_pairs(truth: Array, world: GraphWorldConfig, true_loops: int, rng: np.random.Generator) -> tuple[Ids, Array]:
-    """Return pairs [F, 2] that look like one place, and for each the world's motion [F, d + 1, d + 1] that says so."""
+    """Return pairs [F, 2] that look like one place, and the world's motion [F, d + 1, d + 1] of each."""
     n, size, d = len(truth), world.alias_group, truth.shape[1] - 1
     count = round(world.outlier_fraction / (1.0 - world.outlier_fraction) * true_loops)
     groups = -(-count // size)

@@ -2,7 +2,7 @@
 
 Their detector is the variance of force in a sliding window against a multiple of that at rest; here the rate has to be
 quiet as well, which separates a slow turn about the vertical from rest. `imu/rest.py` has limits instead of multiples,
-also of the mean rate, which do not hold for samples before their calibration; and a pause is cut out to the sample here.
+also of the mean rate, which do not hold before calibration; and a pause is cut out to the sample here.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def fuse_mesh(
 ) -> tuple[Mesh | None, str]:  # fmt: skip
     """Return the mesh of views, and an empty string; or None and the reason there is none.
 
-    Triangles with a vertex of which `is_false` says, given the volume and vertices [N, 3], that no surface is there,
+    Triangles with a vertex where `is_false`, given the volume and vertices [N, 3], finds no surface,
     are left out. When the mesh takes more than `max_blocks` of voxels, the views are asked for again, and voxels are
     larger.
     """

@@ -104,7 +104,7 @@ class KeyframeStore:
         geometry = self.geometry(keyframe_id)
         points = geometry.points_body_m
         shape = (1, 0 if points is None else len(points)) if geometry.depth is None else geometry.depth.shape
-        # the header tells the size, as for depth
+        # the header has the size, as for depth
         is_right = len(packed.labels_png) >= 24 and struct.unpack(">II", packed.labels_png[16:24]) == shape[::-1]
         labels = _decode(packed.labels_png, cv2.IMREAD_UNCHANGED) if is_right else None
         if labels is None or labels.dtype not in (np.uint8, np.uint16) or labels.shape != shape:
@@ -138,7 +138,7 @@ class KeyframeStore:
         """
         packed, none = self._packed[keyframe_id], np.zeros((0, 3), np.uint8)
         if packed.depth_png:
-            # the header tells the size: no memory is taken for an image that cannot be one of ours
+            # the header has the size: no memory is taken for an image that cannot be one of ours
             size = struct.unpack(">II", packed.depth_png[16:24]) if len(packed.depth_png) >= 24 else None
             depth = _decode(packed.depth_png, cv2.IMREAD_UNCHANGED) if size == self._size else None
             if depth is None or depth.dtype != np.uint16 or depth.shape != self._size[::-1]:

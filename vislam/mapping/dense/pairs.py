@@ -105,14 +105,14 @@ def seen_in(depth_m: NDArray[np.float32], K: Array, step: int, max_depth_m: floa
 @njit(cache=True, nogil=True)
 def _pair(a: Planes, b: Planes, K: Array, T_b_a: Array, gate_m: float, step: int) -> tuple[Array, Array, Array]:
     """Return H [6, 6], g [6] and (samples, those that met a surface, sum of their costs)."""
-    H, g, told, J = np.zeros((6, 6)), np.zeros(6), np.zeros(3), np.zeros(6)
+    H, g, sums, J = np.zeros((6, 6)), np.zeros(6), np.zeros(3), np.zeros(6)
     R = np.ascontiguousarray(T_b_a[:3, :3])
     for i in range(0, a.shape[0], step):
         for j in range(0, a.shape[1], step):
             z = a[i, j, 3]
             if z <= 0.0:
                 continue
-            told[0] += 1.0
+            sums[0] += 1.0
             p = np.array([(j - K[0, 2]) / K[0, 0] * z, (i - K[1, 2]) / K[1, 1] * z, z])
             at = R @ p + T_b_a[:3, 3]
             if at[2] <= 0.0:
@@ -135,15 +135,15 @@ def _pair(a: Planes, b: Planes, K: Array, T_b_a: Array, gate_m: float, step: int
             variance = _SIGMA_M**2 + _SIGMA_1M**2 * (z**4 + z_b**4)
             scale2 = max(4.0 * variance, gate_m * gate_m / 9.0)
             w = 1.0 / (variance * (1.0 + r * r / scale2) * _CORRELATED)
-            told[1] += 1.0
-            told[2] += min(r * r / variance, _FAR_SIGMAS**2)
+            sums[1] += 1.0
+            sums[2] += min(r * r / variance, _FAR_SIGMAS**2)
             J[0], J[1], J[2] = p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0]
             J[3:] = n
             for x in range(6):
                 g[x] += w * J[x] * r
                 for y in range(6):
                     H[x, y] += w * J[x] * J[y]
-    return H, g, told
+    return H, g, sums
 
 
 def equations(a: Seen, b: Seen, T_b_a: Array, gate_m: float, step: int) -> Equations:
@@ -152,7 +152,7 @@ def equations(a: Seen, b: Seen, T_b_a: Array, gate_m: float, step: int) -> Equat
     Those farther apart than the gate say nothing.
     """
     H, g, (samples, met, cost) = _pair(a.planes, b.planes, a.K, np.ascontiguousarray(T_b_a), gate_m, step)
-    # in variances: what turned fast or is badly registered says less
+    # in variances: what turned fast or is badly registered counts less
     apart = min(max(cost / max(met, 1.0), _LEAST_APART), _MOST_APART)
     return Equations(H / apart, g / apart, (cost + _FAR_SIGMAS**2 * (samples - met)) / max(samples, 1.0))
 

@@ -1,8 +1,8 @@
 """Poses of all keyframes at once, by the depth images of those that see the same surfaces.
 
 Multiway registration (Choi, Zhou and Koltun, "Robust reconstruction of indoor scenes", CVPR 2015), but with the
-equations of all pairs made anew at the poses of all keyframes in every step, so no pair's own optimum is trusted.
-The poses that came in are priors, of each keyframe and of each against the one before: what surfaces do not tell stays.
+equations of all pairs rebuilt at the poses of all keyframes in every step, so no pair's own optimum is trusted.
+The poses that came in are priors, of each keyframe and of each against the one before: what surfaces do not show stays.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vislam.mapping.mesh.posed import PosedView
 _COLUMNS = 160  # of the grid that planes are on
 _GATES_M = (0.10, 0.07, 0.05, 0.04, 0.03, 0.03)  # by step, coarse to fine
 _STEPS_PX = (4, 4, 2, 2, 2, 2)  # of the grid, between samples
-_LOOK_PX = 8  # between samples that tell whether two views overlap
+_LOOK_PX = 8  # between samples that show whether two views overlap
 _LEAST_OVERLAP = 0.3  # share of a view's samples that meet the other's surfaces
 _REACH_M = 3.0  # between two cameras that are asked
 _PARTNERS = 12  # of a keyframe among older ones, evenly over time
@@ -66,8 +66,8 @@ def refined(views: Iterable[PosedView]) -> Refined:
         return Refined(T0, 0, 0.0, 0.0)
     T = T0.copy()
     for gate_m, step in zip(_GATES_M, _STEPS_PX, strict=True):
-        told = [equations(seen[a], seen[b], invert(T[b]) @ T[a], gate_m, step) for a, b in pairs]
-        T = _moved(T, T0, pairs, told)
+        systems = [equations(seen[a], seen[b], invert(T[b]) @ T[a], gate_m, step) for a, b in pairs]
+        T = _moved(T, T0, pairs, systems)
     before, after = (_cost(seen, pairs, poses) for poses in (T0, T))
     is_better = after < (1.0 - _LEAST_GAIN) * before
     return Refined(T if is_better else T0, len(pairs), before, after if is_better else before)
@@ -91,16 +91,16 @@ def overlapping(seen: list[Seen], T_map_view: Array) -> list[tuple[int, int]]:
 
 
 def _cost(seen: list[Seen], pairs: list[tuple[int, int]], T: Array) -> float:
-    told = [equations(seen[a], seen[b], invert(T[b]) @ T[a], _GATES_M[-1], _STEPS_PX[0]) for a, b in pairs]
-    return float(np.mean([pair.cost for pair in told]))
+    systems = [equations(seen[a], seen[b], invert(T[b]) @ T[a], _GATES_M[-1], _STEPS_PX[0]) for a, b in pairs]
+    return float(np.mean([pair.cost for pair in systems]))
 
 
-def _moved(T: Array, T0: Array, pairs: list[tuple[int, int]], told: list[Equations]) -> Array:
+def _moved(T: Array, T0: Array, pairs: list[tuple[int, int]], systems: list[Equations]) -> Array:
     """Return the poses [N, 4, 4] after one step of Gauss-Newton, each moved in its own frame."""
     blocks: list[tuple[int, int, Array]] = []
     g = np.zeros((len(T), 6))
     # a pair moves a against b: in a's frame, b's motion comes in by the adjoint
-    for (a, b), pair in zip(pairs, told, strict=True):
+    for (a, b), pair in zip(pairs, systems, strict=True):
         _add(blocks, g, (a, b), pair.H, pair.g, se3_adjoint(invert(T[a]) @ T[b]))
     for k in range(len(T)):
         H = np.diag(_SIGMA_POSE**-2)

@@ -33,8 +33,8 @@ def refined_poses(
     if len(ids) > _MOST:
         return {}, {"refused": f"{len(ids)} keyframes with depth, more than {_MOST}"}
     found = refined(posed_views(((store.scan(i), poses[i]) for i in ids), view))
-    told = {"pairs": found.pairs, "cost_before": found.cost_before, "cost_after": found.cost_after}
+    report = {"pairs": found.pairs, "cost_before": found.cost_before, "cost_after": found.cost_after}
     if not found.cost_after < found.cost_before:
-        return {}, told
+        return {}, report
     T_refined = found.T_map_view @ invert(view.T_body_view)
-    return poses | dict(zip(ids, T_refined, strict=True)), told
+    return poses | dict(zip(ids, T_refined, strict=True)), report

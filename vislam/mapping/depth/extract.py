@@ -1,4 +1,4 @@
-"""What a keyframe can tell the map: depth from its sensor, from its second camera, or a few triangulated points."""
+"""What a keyframe can give the map: depth from its sensor, from its second camera, or a few triangulated points."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Guess:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthAnswer:
-    """What depth says of a guess."""
+    """What depth shows of a guess."""
 
     accepted: bool
     reason: str  # why it was refused; empty otherwise

@@ -23,7 +23,7 @@ def stored_depth(
     """Return what finds the depth camera of a rig among keyframes of a map, and their ids in the order it has them.
 
     `T_map_body` gives the pose [4, 4] of each id in `scans`; keyframes without a depth image are left out. Images are
-    unpacked when they are needed. Raises DataError for poses that are none; damaged scans are told when asked for.
+    unpacked when they are needed. Raises DataError for poses that are none; damaged scans are reported when asked for.
     """
     camera, view = rig.cameras[0], rgbd_view(rig, config)
     localiser = DepthLocaliser(camera, rig.T_body_cams[0], _thinned(camera, config.pixel_step))

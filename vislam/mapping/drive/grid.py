@@ -110,8 +110,8 @@ def read_grid(folder: Path, name: str = "grid") -> GridImage:
     """Return what `write_grid` wrote as `NAME.pgm` and `NAME.yaml`; raises DataError when they are something else."""
     image, description = folder / f"{name}.pgm", folder / f"{name}.yaml"
     try:
-        told = yaml.safe_load(read_text(description, _MAX_DESCRIPTION_BYTES))
-        resolution, origin = float(told["resolution"]), [float(value) for value in told["origin"]]
+        described = yaml.safe_load(read_text(description, _MAX_DESCRIPTION_BYTES))
+        resolution, origin = float(described["resolution"]), [float(value) for value in described["origin"]]
         if not (np.isfinite([resolution, *origin]).all() and resolution > 0.0 and len(origin) == 3):
             raise ValueError("resolution or origin cannot be")
     except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError) as error:

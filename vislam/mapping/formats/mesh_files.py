@@ -73,7 +73,7 @@ def _primitive(
     parts: list[_Part], points_m: NDArray[np.float32], name: str, attribute: _Part, triangles: NDArray[np.int32],
     material: int,
 ) -> dict[str, object]:  # fmt: skip
-    """Add points, their attribute and triangles to the parts of a file, and return what glTF says of them."""
+    """Add points, their attribute and triangles to the parts of a file, and return what glTF states of them."""
     first = len(parts)
     corners = _Part(triangles.reshape(-1, 1), "<u4", _UNSIGNED_INT, "SCALAR", _INDICES)
     parts += [_Part(points_m, "<f4", _FLOAT, "VEC3", _VERTICES), attribute, corners]

@@ -108,7 +108,7 @@ def read_ply_mesh(path: Path) -> tuple[Points, Colors, NDArray[np.int32]]:
 
 
 def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.dtype[np.void]]]) -> NDArray[np.void]:
-    """Return the rows [N] of a file, whose header says how many there are and what each holds.
+    """Return the rows [N] of a file, whose header states how many there are and what each holds.
 
     The header's reader leaves the file where the rows begin. Raises DataError when the file cannot be read or is cut
     short, before memory is taken.

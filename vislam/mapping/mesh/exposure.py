@@ -47,7 +47,7 @@ def exposure_gains(seen: Sequence[tuple[NDArray[np.int64], ImageU8]], count: int
 
 
 def _solved(place: NDArray[np.int64], view: NDArray[np.int64], logs: Array, size: tuple[int, int]) -> Array:
-    """Return logarithms of gains [V, 3]; what a place is like is eliminated, and gains that nothing tells are 0."""
+    """Return logarithms of gains [V, 3]; what a place is like is eliminated, and gains without any evidence are 0."""
     saw = csr_matrix((np.ones(len(place)), (place, view)), shape=size)
     often = np.maximum(np.bincount(place, minlength=size[0]), 1)
     together = saw.T @ csr_matrix(saw.multiply(1.0 / often[:, None]))

@@ -26,7 +26,7 @@ _MOST_TRUNCATION_VOXELS = 8.0  # more, and what is behind thin things is lost, a
 _SIGMA_1M = 0.0025  # of depth from structured light at one metre; it grows with the square of depth
 _MIN_FACING = 0.15  # cosine between ray and surface; a more grazing ray is taken for this
 _SIDES_RATIO = 0.02  # neighbouring pixels of one surface differ by less than this share of depth
-_BEHIND_SHARE = 0.5  # of the weight, behind the surface at the end of the truncation: nobody has seen what is there
+_BEHIND_SHARE = 0.5  # of the weight, behind the surface at the end of the truncation: what is there is unseen
 _MAX_WEIGHT = 1e4
 
 

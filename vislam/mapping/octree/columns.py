@@ -111,7 +111,7 @@ def _changed(old_blocks: _I64, old_bits: _U64, blocks: _I64, bits: _U64) -> _I64
 
 
 def _spread(tiles: _I16, table: _I64, nothing: int) -> _I16:
-    """Return tiles [T, 8, 8, ...] laid out as the table [rows, columns] says; index T is an empty one."""
+    """Return tiles [T, 8, 8, ...] laid out as in the table [rows, columns]; index T is an empty one."""
     padded = np.concatenate([tiles, np.full((1, *tiles.shape[1:]), nothing, tiles.dtype)])
     laid = padded[table].swapaxes(1, 2)
     return np.ascontiguousarray(laid).reshape(table.shape[0] * _EDGE, table.shape[1] * _EDGE, *tiles.shape[3:])

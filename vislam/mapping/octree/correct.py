@@ -2,7 +2,7 @@
 
 Clamped updates cannot be taken back, so a correction means integrating again, in the order of time. What each keyframe
 said of voxels is kept, a bit each, compressed. So only keyframes that moved cast their rays again; the blocks that they
-touched, before or now, are made anew from what all keyframes said of them. That is done beside the map, a bounded
+touched, before or now, are rebuilt from what all keyframes said of them. That is done beside the map, a bounded
 number of keyframes per call, and put in its place at once. The result is bit for bit the map that the same poses would
 have given from the start.
 """
@@ -51,12 +51,12 @@ class _Said:
 
 @dataclass(slots=True, eq=False)
 class _Patch:
-    """A correction under way: first keyframes that moved cast their rays, then blocks are made anew."""
+    """A correction under way: first keyframes that moved cast their rays, then blocks are rebuilt."""
 
     waiting: list[int]  # keyframes that have yet to cast their rays
     gone: list[int]  # keyframes that are in the map and are not to be
     moved: dict[int, _Said] = field(default_factory=dict)
-    blocks: Octree | None = None  # those that are made anew
+    blocks: Octree | None = None  # those that are rebuilt
     replayed: int = 0  # keyframes of which they hold what was said
 
 
@@ -195,7 +195,7 @@ class CorrectedOccupancy:
         self._said[keyframe_id] = said
 
     def _trace(self, keyframe_id: int, scan: Scan, T_map_body: Array) -> ScanMarks:
-        """Return what a scan says; nothing where no octree can hold it: a wild pose must not cost the whole map."""
+        """Return the marks of a scan; nothing where no octree can hold it: a wild pose must not cost the whole map."""
         self.left_out.pop(keyframe_id, None)
         try:
             return self._marks(scan, T_map_body)

@@ -46,7 +46,7 @@ class Occupancy(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanMarks:
-    """What one scan says of voxels, wherever the map stands: which are free and which are hit."""
+    """What one scan shows of voxels, wherever the map stands: which are free and which are hit."""
 
     points: int  # that were used
     blocks: NDArray[np.int64]  # [B] keys of blocks
@@ -116,7 +116,7 @@ class Octree:
         max_range_m: float = -1.0,
         insertion: Insertion = "discretised",
     ) -> ScanMarks:
-        """Return what one scan of points [N, 3] seen from `origin_map_m` [3] says of voxels; the map stays as it is.
+        """Return what one scan of points [N, 3] seen from `origin_map_m` [3] shows of voxels; the map stays as it is.
 
         Points beyond `max_range_m` (negative: no limit) only clear the way up to it; points that are not finite are
         left out. "discretised" casts one ray per end voxel, "full" one per point. Raises DataError when a point lies
@@ -147,12 +147,12 @@ class Octree:
         return ScanMarks(len(points), keys, bits)
 
     def apply(self, marks: ScanMarks) -> None:
-        """Update every voxel that a scan says anything of; raises DataError when the map would outgrow any machine."""
+        """Update every voxel that a scan marks; raises DataError when the map would outgrow any machine."""
         self.pool.reserve(len(marks.blocks))
         self._apply(marks, False)
 
     def apply_to_known_blocks(self, marks: ScanMarks) -> None:
-        """Update the voxels that a scan says anything of in the blocks that the map has."""
+        """Update the voxels that a scan marks in the blocks that the map has."""
         self._apply(marks, True)
 
     def _apply(self, marks: ScanMarks, only_known: bool) -> None:

@@ -65,7 +65,7 @@ def _header(title: bytes, kind: str, nodes: int, resolution_m: float) -> bytes:
 def read_octree(path: Path, occupied_probability: float = 0.971, free_probability: float = 0.1192) -> OctreeLeaves:
     """Return the octree of a `.bt` or `.ot` file, of which an inner node's own values are not kept.
 
-    Leaves of a `.bt` get OctoMap's clamping thresholds unless told otherwise. Raises DataError when the file is not a
+    Leaves of a `.bt` get OctoMap's clamping thresholds unless others are given. Raises DataError when the file is not a
     complete tree of kind OcTree or ColorOcTree. Memory is bounded by the file's size.
     """
     try:

@@ -110,7 +110,7 @@ def _cells(low: float, high: float) -> tuple[int, int]:
 
 @njit(cache=True, nogil=True)
 def _apart(d: Array, half: Array, R: Array) -> bool:
-    """Tell whether a box and the unit cube at offset `d` from its centre have a separating axis."""
+    """Return whether a box and the unit cube at offset `d` from its centre have a separating axis."""
     for i in range(3):
         along = abs(R[0, i] * d[0] + R[1, i] * d[1] + R[2, i] * d[2])
         if along >= half[i] + 0.5 * (abs(R[0, i]) + abs(R[1, i]) + abs(R[2, i])):
@@ -163,7 +163,7 @@ def boxes(centres: Array, half_m: Array, R: Array, resolution: float, table: _I6
 
 @njit(cache=True, nogil=True)
 def _square_apart(corners: Array, x: int, y: int) -> bool:
-    """Tell whether a convex polygon and the unit square at a cell are separated by one of the polygon's edges."""
+    """Return whether a convex polygon and the unit square at a cell are separated by one of the polygon's edges."""
     for i in range(len(corners)):
         j = (i + 1) % len(corners)
         nx, ny = corners[j, 1] - corners[i, 1], corners[i, 0] - corners[j, 0]

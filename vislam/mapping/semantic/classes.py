@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.reading import read_text
 
-UNLABELLED = 0  # the id that says nothing
+UNLABELLED = 0  # the id without a meaning
 MAX_ID = 65535
 FILE_NAME = "labels.toml"
 _MAX_CLASSES = 4096

@@ -1,7 +1,7 @@
 """The labels of keyframes fused at their newest poses.
 
 What each keyframe said is kept on its own rays, as its depth is. So a correction carries labels along: when a keyframe
-that was counted has moved, votes are counted anew, and the result is that of the same poses from scratch.
+that was counted has moved, votes are counted again, and the result is that of the same poses from scratch.
 """
 
 from __future__ import annotations

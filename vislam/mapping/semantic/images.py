@@ -35,7 +35,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Labeller(Protocol):
-    """What tells the labels of keyframes: a folder of images, or a network that looks at each."""
+    """The source of keyframes' labels: a folder of images, or a network that looks at each."""
 
     classes: LabelClasses
 
@@ -132,7 +132,7 @@ class LabelRays:
 
 
 def label_warnings(counters: Mapping[str, int]) -> list[str]:
-    """Return what of a map's counters says that label images were missing or bad."""
+    """Return those of a map's counters by which label images were missing or bad."""
     found = [(kind, counters.get(kind, 0)) for kind in (_MISSING, _REFUSED, _UNKNOWN)]
     return [f"{count} {kind}; log.txt names the first" for kind, count in found if count]
 
@@ -192,7 +192,7 @@ def _check_size(size: tuple[int, int], camera: Camera) -> None:
 
 
 def _stamp_ns(stem: str) -> int | None:
-    """Return the stamp that a name tells: whole nanoseconds, or seconds with a decimal point."""
+    """Return the stamp that a name states: whole nanoseconds, or seconds with a decimal point."""
     whole, point, part = stem.partition(".")
     if not (stem.isascii() and whole.isdecimal() and len(whole) <= _MAX_DIGITS):
         return None

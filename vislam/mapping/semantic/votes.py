@@ -102,7 +102,7 @@ def _link(keys: _I64, count: int, table: _I64, rows: NDArray[np.int32]) -> None:
 
 
 class VoxelVotes:
-    """Votes at the voxels of an octree, over any number of keyframes, for at most so many voxels."""
+    """Votes at the voxels of an octree, over any number of keyframes, for a bounded number of voxels."""
 
     def __init__(self, resolution_m: float, max_voxels: int) -> None:
         self.resolution_m = resolution_m
@@ -115,7 +115,7 @@ class VoxelVotes:
         self._rows = np.zeros(1 << 12, np.int32)
 
     def add(self, points_m: NDArray[np.float32], labels: NDArray[np.uint16]) -> None:
-        """Count what one keyframe says of its points [N, 3]; label 0 says nothing."""
+        """Count one keyframe's labels of its points [N, 3]; label 0 does not count."""
         keys = voxel_keys(points_m, self.resolution_m)
         used = (labels > 0) & (keys >= 0)
         keys, chosen = majority(keys[used], labels[used])

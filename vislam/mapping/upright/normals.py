@@ -21,7 +21,7 @@ _MOST = 2000  # normals per keyframe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one keyframe says of directions, in the frame of the map."""
+    """What one keyframe shows of directions, in the frame of the map."""
 
     normals: NDArray[np.float32]  # [N, 3], towards the camera
     right: Array  # [3] of the image

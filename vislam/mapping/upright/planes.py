@@ -65,14 +65,14 @@ def surest_up(views: Callable[[int], Sequence[View]]) -> Up:
 
 
 def _refines(up: Up, first: Up) -> bool:
-    """Return whether one says what the other says; neither does where one is unknown."""
+    """Return whether the two agree; neither does where one is unknown."""
     if up.direction is None or first.direction is None:
         return False
     return angle_deg(up.direction, first.direction) < _APART_DEG
 
 
 def up_of_planes(views: Sequence[View]) -> Up:
-    """Return which way is up by the surfaces of keyframes; unknown where they do not tell. Deterministic."""
+    """Return which way is up by the surfaces of keyframes; unknown where they do not show it. Deterministic."""
     evidence = _gathered(views)
     if len(evidence.normals) < _LEAST_NORMALS:
         return _unknown(f"{len(views)} keyframes with depth show {len(evidence.normals)} flat places, too few")
@@ -96,7 +96,7 @@ def up_of_planes(views: Sequence[View]) -> Up:
 
 
 def _unknown(reason: str) -> Up:
-    return Up.unknown(f"the surfaces do not tell: {reason}")
+    return Up.unknown(f"the surfaces do not show it: {reason}")
 
 
 def _gathered(views: Sequence[View]) -> _Evidence:

@@ -1,7 +1,7 @@
 """What goes wrong with sensors, put into the values of any recording as it is read: nothing is written to disk.
 
-A fault changes the stream of values, or what is told of the cameras; the truth stays. Frames that come as tracks
-(`points:`) have no images, so faults of images do not fit them; `Fault.fits` says so.
+A fault changes the stream of values, or what is stated of the cameras; the truth stays. Frames that come as tracks
+(`points:`) have no images, so faults of images do not fit them; see `Fault.fits`.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _frozen(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterato
 
 
 def _person(events: Iterator[Event], rig: Rig, rng: np.random.Generator) -> Iterator[Event]:
-    """Put somebody over a half of the image who walks to and fro 2 m away, dressed in a pattern."""
+    """Put a person over a half of the image who walks to and fro 2 m away, dressed in a pattern."""
     size = (rig.cameras[0].height, rig.cameras[0].width)
     cloth = sum(cv2.resize(rng.random((size[0] // n, size[1] // n)), size[::-1]) for n in (4, 12, 36))
     cloth_u8 = (cloth * (255.0 / 3.0)).astype(np.uint8)
@@ -324,11 +324,11 @@ def _missing(six: Array, since_s: float, _: np.random.Generator) -> Array | None
     return None if in_window(since_s, _BEGIN_S, 1.5) else six
 
 
-# -- what is told of the cameras ---------------------------------------------------------------------------------------
+# -- what is stated of the cameras -------------------------------------------------------------------------------------
 
 
 def _turned(rig: Rig, deg: float) -> Rig:
-    """Return a rig that is told to stand otherwise on the body by so many degrees, about the body's origin."""
+    """Return a rig that is stated to be turned on the body by `deg` degrees, about the body's origin."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(deg) * _AXIS).as_matrix()
     return Rig(rig.cameras, tuple(turn @ T for T in rig.T_body_cams), rig.has_depth)
@@ -350,14 +350,14 @@ FAULTS: Mapping[str, Fault] = {
     "blur": Fault("3 s out of focus", _needs("images"), _images(_blur)),
     "salt": Fault("5 % of the pixels are salt and pepper", _needs("images"), _images(_salt)),
     "frozen": Fault("the same image again and again for 3 s", _needs("images"), _frozen),
-    "person": Fault("somebody over half of the image, from 5 s on", _needs("images"), _person),
-    "rolling": Fault("a rolling shutter of 30 ms that nobody told of", _needs("images", "imu"), partial(
+    "person": Fault("a person over half of the image, from 5 s on", _needs("images"), _person),
+    "rolling": Fault("a rolling shutter of 30 ms that is not stated", _needs("images", "imu"), partial(
         _rolling, readout_s=0.03)),
     "depth": Fault("depth 5 % too long", _needs("depth", "images"), _depth_scaled),
     "dropped": Fault("a fifth of the frames never arrives", _needs(), _dropped),
     "late": Fault("the camera's clock is 20 ms late", _needs("imu"), partial(_late, late_s=0.02)),
     "swapped": Fault("the cables of a stereo pair are swapped", _needs("stereo"), _swapped),
-    "turned": Fault("the camera is told 3 degrees wrong on the body", _needs("imu"), None, partial(_turned, deg=3.0)),
+    "turned": Fault("the camera is stated 3 degrees wrong on the body", _needs("imu"), None, partial(_turned, deg=3.0)),
     "focal": Fault("focal length 2 % too long", _needs(), None, partial(_focal, factor=1.02)),
     "noise": Fault("white noise eight times that of the model", _needs("imu"), _noisy),
     "slow": Fault("a quarter of the inertial samples arrives", _needs("imu"), _thinned),

@@ -53,7 +53,7 @@ class Vibration:
         self._values = np.asarray(filtfilt(b, a, values[near], axis=0)[window])
 
     def at_rate(self, rate_hz: float) -> Array:
-        """Return the readings [M, 6] at so many a second."""
+        """Return the readings [M, 6] at `rate_hz` a second."""
         ratio = Fraction(rate_hz / self.rate_hz).limit_denominator(200)
         if ratio == 1:
             return self._values
@@ -68,7 +68,7 @@ class ShakenRecording(WrappedRecording):
         super().__init__(recording)
         rate_hz = 0.0 if recording.imu_noise is None else recording.imu_noise.rate_hz
         readings = gain * vibration.at_rate(rate_hz or vibration.rate_hz)
-        self._readings = np.concatenate([readings, readings[-2:0:-1]])  # and back: no jump where it begins anew
+        self._readings = np.concatenate([readings, readings[-2:0:-1]])  # and back: no jump where it begins again
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
         """Yield the recording's values."""

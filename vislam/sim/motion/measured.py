@@ -4,11 +4,11 @@ Truth at 20 Hz misses what the body does between two poses, and its derivatives 
 but drifts. So both are joined as a complementary filter joins them: the inertial data are integrated, and the slow
 difference to the truth is a smooth spline. It passes through every true position that was used. Rotations of motion
 capture are worse than a gyroscope's over seconds (against it, those of EuRoC's V1_01 and V2_01 err by 0.07 to 0.09 deg
-within half a second and 0.4 to 0.5 deg within five; on MH_01 0.01 and 0.05 deg): truth only tells how the gyroscope
+within half a second and 0.4 to 0.5 deg within five; on MH_01 0.01 and 0.05 deg): truth only shows how the gyroscope
 drifts. So what a virtual camera sees agrees with the real inertial data, as that of a real camera does.
 
 The world of a motion capture is never quite level (half a degree in EuRoC's V2_01, 2 cm over its room). The
-accelerometer tells how much, and the world is turned upright.
+accelerometer shows how much, and the world is turned upright.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class MeasuredMotion:
     def at(self, t_s: Array) -> Motion:
         """Return the motion at times [N] in seconds; times outside are held at the ends.
 
-        Rates and accelerations are what the IMU says, less mean bias and drift: they carry its noise.
+        Rates and accelerations are the IMU's, less mean bias and drift: they carry its noise.
         """
         t_s = np.clip(np.asarray(t_s, dtype=np.float64), self.begin_s, self.end_s)
         T = np.zeros((len(t_s), 4, 4))
@@ -118,7 +118,7 @@ def _up(t_s: Array, R: Array, accel: Array, path: CubicSpline) -> Array:
     """Return the unit vector [3] that is up in the truth's world, by the changes of velocity in half-second pieces.
 
     A constant bias [3] in the body and a tilt of gravity [2] in the world explain best what the accelerometer and the
-    positions disagree on; a body that does not turn cannot tell them apart, and then the world counts as level.
+    positions disagree on; a body that does not turn does not separate them, and then the world counts as level.
     """
     step = max(round(_PIECE_S / float(np.median(np.diff(t_s)))), 1)
     h = np.diff(t_s)[:, None]

@@ -1,4 +1,4 @@
-"""How somebody who carries the camera walks along a path: with bob, sway and a wandering gaze."""
+"""How a person who carries the camera walks along a path: with bob, sway and a wandering gaze."""
 
 from __future__ import annotations
 

@@ -80,9 +80,9 @@ class SimulatedTracker:
         self._on_person: Array = np.empty((0, 2))  # [N, 2] place on the person, relative to its middle
 
     def see(self, t_s: float, moving: bool) -> Observations:
-        """Return what is followed at a time in seconds; `moving` tells whether the person is there.
+        """Return what is followed at a time in seconds; `moving` states whether the person is there.
 
-        Track ids ascend. Outliers and slips are in it, unmarked; `landmarks` and `slipped` tell the truth until the
+        Track ids ascend. Outliers and slips are in it, unmarked; `landmarks` and `slipped` have the truth until the
         next call, for `track_ids_all`.
         """
         dt_s = 0.0 if self._last_s is None else t_s - self._last_s

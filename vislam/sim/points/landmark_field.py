@@ -17,7 +17,7 @@ _NEAR_M, _MIDDLE_M, _FAR_M = 1.5, 8.0, 30.0  # walls and furniture between the f
 _FAR_SHARE = 0.12
 _CLEARANCE_M = 0.9  # from the path: the body does not drive through things
 _REACH_M = 16.0  # anchors further away do not count
-_STRIDE_M = 1.0  # the camera may move so far before the points around it are chosen anew
+_STRIDE_M = 1.0  # the camera may move so far before the points around it are chosen again
 
 
 class LandmarkField:
@@ -52,7 +52,7 @@ class LandmarkField:
 
 
 class Surroundings:
-    """The points around a moving camera; chosen anew only when it has moved far enough to matter."""
+    """The points around a moving camera; chosen again only when it has moved far enough to matter."""
 
     def __init__(self, field: LandmarkField) -> None:
         """Start nowhere."""

@@ -41,7 +41,7 @@ _WORLD_ZERO_NS = 1_000_000_000_000
 _MARGIN_S = 0.05  # frames keep this distance from the ends of the motion
 _TRUTH_STEP_S = 0.01  # so dense that a straight line between poses is exact enough
 _PATH_STEP_S = 0.1  # of the path around which landmarks are placed
-_AXIS = np.array([0.6, -0.64, 0.48])  # about which told and true extrinsics differ, in the camera's axes
+_AXIS = np.array([0.6, -0.64, 0.48])  # about which stated and true extrinsics differ, in the camera's axes
 _AT_ONCE = 2000  # poses evaluated in one go
 
 
@@ -69,9 +69,9 @@ class PointOptions:
     moving_begin_s: _Seconds = 0.0
     moving_length_s: _Seconds | None = None  # None: to the end
     time_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0  # to be added to a frame's stamp to get the IMU's
-    extrinsic_rotation_deg: Annotated[float, Field(ge=-20.0, le=20.0)] = 0.0  # between the rig told and the true one
+    extrinsic_rotation_deg: Annotated[float, Field(ge=-20.0, le=20.0)] = 0.0  # between the stated rig and the true one
     readout_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0  # from first to last row; the stamp is the middle row's
-    imu_noise_factor: Annotated[float, Field(gt=0.0)] = 1.0  # what is told of the IMU's noise, relative to the truth
+    imu_noise_factor: Annotated[float, Field(gt=0.0)] = 1.0  # what is stated of the IMU's noise, relative to the truth
     imu_noise: bool = True  # of a simulated IMU; False: exact
     gravity_m_s2: float = 9.81  # of a simulated IMU
     world_seed: int = 0  # of the landmarks; `seed` is that of motion and sensors
@@ -104,7 +104,7 @@ class PointRecording:
     """A recording (see `vislam.core.recording.Recording`) whose frames carry tracks; the same each time.
 
     Attributes:
-        true_rig: the cameras that projected the landmarks; `rig` is what the estimator is told.
+        true_rig: the cameras that projected the landmarks; `rig` is what the estimator is given.
         motion: the body's true motion; its seconds count from `zero_ns`.
         field: the landmarks.
     """
@@ -146,7 +146,7 @@ class PointRecording:
         self._imu = SimulatedImu(
             motion, self.zero_ns, (self._begin_s, self._end_s), CONSUMER_IMU, options.gravity_m_s2, imu_seed, disturbed
         )
-        self.imu_noise: ImuNoise | None = _told(CONSUMER_IMU, options.imu_noise_factor)
+        self.imu_noise: ImuNoise | None = _stated(CONSUMER_IMU, options.imu_noise_factor)
 
     def _take_recording(self, recorded: MeasuredInertial) -> None:
         motion = MeasuredMotion(recorded.t_ns, recorded.gyro_rad_s, recorded.accel_m_s2, recorded.truth)
@@ -156,7 +156,7 @@ class PointRecording:
         self._base_rig = own if own is not None and own.is_stereo else vi_sensor_rig()
         span_ns = (self._ns(np.array([self._begin_s, self._end_s]))).tolist()
         self._imu = RecordedImu(recorded.t_ns, recorded.gyro_rad_s, recorded.accel_m_s2, span_ns[0], span_ns[1])
-        self.imu_noise = _told(recorded.noise, self.options.imu_noise_factor)
+        self.imu_noise = _stated(recorded.noise, self.options.imu_noise_factor)
         if recorded.truth_fit is not None and recorded.truth_fit.summary:
             self.problems[f"{recorded.truth_fit.summary}: undone"] = 1
 
@@ -180,8 +180,8 @@ class PointRecording:
         turn = np.eye(4)
         turn[:3, :3] = Rotation.from_rotvec(_AXIS * np.deg2rad(options.extrinsic_rotation_deg)).as_matrix()
         first = base.T_body_cams[0] @ turn
-        told = (first, first @ base.T_cam0_cam1) if count == 2 else (first,)
-        self.rig = Rig(cameras[:count], told, has_depth=options.rig == "rgbd")
+        given = (first, first @ base.T_cam0_cam1) if count == 2 else (first,)
+        self.rig = Rig(cameras[:count], given, has_depth=options.rig == "rgbd")
 
     def _frame_times(self) -> Array:
         shutter_s = 0.5 * self.options.readout_s
@@ -259,7 +259,7 @@ class PointRecording:
         return np.round(t_s * 1e9).astype(np.int64) + self.zero_ns
 
 
-def _told(noise: ImuNoise, factor: float) -> ImuNoise:
+def _stated(noise: ImuNoise, factor: float) -> ImuNoise:
     return replace(
         noise,
         gyroscope_noise_density=noise.gyroscope_noise_density * factor,

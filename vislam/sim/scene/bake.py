@@ -44,7 +44,7 @@ class _Light:
 def _blocked(
     origin: Array, direction: Array, reach: float, centres: Array, halves: Array, chosen: NDArray[np.int64]
 ) -> bool:
-    """Tell whether a chosen solid lies within `reach` along a unit direction; one around the origin does not count."""
+    """Return whether a chosen solid lies within `reach` along a unit direction; one around the origin is ignored."""
     for s in chosen:
         enter, leave = 0.0, reach
         for k in range(3):

@@ -27,7 +27,7 @@ def tile_bounds(rays: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def _outside(box: Array, bounds: Array, slack: float) -> bool:
-    """Tell whether a box (centre and half axes [4, 3], camera frame) misses a frustum of x/z and y/z bounds."""
+    """Return whether a box (centre and half axes [4, 3], camera frame) misses a frustum of x/z and y/z bounds."""
     for side in range(4):
         axis = side // 2
         sign = 1.0 if side % 2 == 0 else -1.0

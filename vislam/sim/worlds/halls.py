@@ -1,7 +1,7 @@
-"""The world `aliased-halls`: four halls around a block that look alike, made to fool whoever trusts appearance.
+"""The world `aliased-halls`: four halls around a block that look alike, made to fool what trusts appearance.
 
 A quarter of the world is one hall and the corridor that leads to it; the other three are the same quarter turned about
-the middle, painted with the same pixels. Only a number on the wall tells the first three halls apart; the fourth has
+the middle, painted with the same pixels. Only a number on the wall distinguishes the first three halls; the fourth has
 the same furniture in other places. The walk enters every hall the same way, so that not only single views agree with
 the wrong hall but whole sequences of them. It passes its start again and goes on for half a round: true revisits.
 """
@@ -125,7 +125,7 @@ def _rearranged(part: SceneBuilder, rng: np.random.Generator) -> None:
 
 
 def _number(part: SceneBuilder, quarter: int) -> None:
-    """Hang the number of the hall where somebody who looks for it sees it."""
+    """Hang the number of the hall where one who looks for it sees it."""
     corner = (_CENTRE_M + _HALL_M - 0.01, -_CENTRE_M + 0.25, 2.35)
     plate = signs.sign((225, 225, 225), f"H{quarter + 1}")
     part.rectangle(corner, (0.0, -0.5, 0.0), (0.0, 0.0, -0.3), plate, 260.0)

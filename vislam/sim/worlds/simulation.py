@@ -28,7 +28,7 @@ from vislam.sim.sensing import DepthNoise, Imager, exposure_gains, sense_depth, 
 from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, make_rig
 from vislam.trajectory import Trajectory
 
-_START_NS = 1_000_000_000_000  # not zero, so that nobody can rely on it
+_START_NS = 1_000_000_000_000  # not zero, so that no code can rely on it
 _MARGIN_S = 0.05  # frames keep this distance from both ends, so that shutters and blur stay inside the motion
 Event = ImuSample | MagSample | Frame
 _AHEAD = 3  # frames under way or waiting, per worker: enough to ride over a slow keyframe
@@ -39,7 +39,7 @@ class SimOptions:
     """What can be chosen about a simulated recording."""
 
     rig: RigKind | None = None  # None: the world's own
-    duration_s: Annotated[float, Field(ge=0.5)] | None = None  # only the first so many seconds
+    duration_s: Annotated[float, Field(ge=0.5)] | None = None  # seconds from the beginning
     camera_hz: Annotated[float, Field(gt=0.1, le=120.0)] | None = None  # None: the world's own
     image_width_px: Annotated[int, Field(ge=64, le=1920, multiple_of=4)] = 640  # 4:3
     exposure_s: Annotated[float, Field(ge=0.0, le=0.05)] | None = None  # motion blur; 0: none, None: the world's own

@@ -112,7 +112,7 @@ class DepthFilter:
     def hand_over(self, T_ref_next: Array, prior: tuple[ImageF32, ImageF32]) -> tuple[ImageF32, ImageF32]:
         """Return a prior for the next reference image, at `T_ref_next`: what is known here, and `prior` elsewhere.
 
-        Its sigma is `handover_sigma` of inverse depth at least, so that every image measures anew.
+        Its sigma is `handover_sigma` of inverse depth at least, so that every image measures again.
         """
         _check_rigid(np.asarray(T_ref_next, dtype=np.float64))
         T = invert(np.ascontiguousarray(T_ref_next, dtype=np.float64))

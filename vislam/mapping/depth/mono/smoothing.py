@@ -1,4 +1,4 @@
-"""What neighbours know of one another: pixels that nobody supports leave, the rest are smoothed inside surfaces."""
+"""What neighbours know of one another: pixels without support leave, the rest are smoothed inside surfaces."""
 
 from __future__ import annotations
 

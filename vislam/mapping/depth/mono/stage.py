@@ -17,7 +17,7 @@ from vislam.mapping.depth.mono.depth_filter import DepthFilter
 from vislam.mapping.depth.mono.prior import flat_prior, points_prior
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
-_GRID = 5  # points across and down that tell how much of the reference image a camera still sees
+_GRID = 5  # points across and down that show how much of the reference image a camera still sees
 _POINT_ERROR_PX = 3.0  # of a track against its epipolar line, in a full image
 _POINT_RATIO = 0.3  # sigma of a point's inverse depth over it, if a track is a pixel off
 

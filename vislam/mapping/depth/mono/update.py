@@ -114,7 +114,7 @@ def update_rows(begin: int, end: int, belief: Belief, rules: Rules, views: Views
             sigma_px = match_sigma_px(along, eu * eu + ev * ev, rules)
             worthwhile = line.expected * (sigma_px / rules.sigma_px) < rules.max_sigma_ratio * sigma
             if not worthwhile or along < rules.min_gradient**2:
-                continue  # too little parallax to tell more than is known, or the texture runs along the line
+                continue  # too little parallax to learn more than is known, or the texture runs along the line
             if HALF * max(abs(warp[0] - 1.0) + abs(warp[1]), abs(warp[2]) + abs(warp[3] - 1.0)) > rules.warp_px:
                 mean, squares = load_warped(patch, reference, y, x, warp)
                 if squares < 0.0:
