@@ -216,5 +216,5 @@ def test_a_run_of_the_virtual_cart_remembers_its_bias(tmp_path: Path) -> None:
 def test_a_damaged_memory_is_refused_before_anything_starts(tmp_path: Path) -> None:
     memory = tmp_path / "biases.json"
     memory.write_text('{"gyro_biases": [{"temperature_c": 1e9, "gyro_bias_rad_s": [0, 0, 0]}]}')
-    with pytest.raises(DataError, match="delete it to begin anew"):
+    with pytest.raises(DataError, match="delete it to begin again"):
         live(tmp_path, memory)

@@ -100,7 +100,7 @@ WRONG = {
     "[sensors.a]\nkind='range'\nanchors={x=[0,0,0]}": "anchor 'x' has to be a number",
     "[sensors.a]\nkind='range'\nanchors={1=[0,0]}": "option anchors.1",
     "[sensors.a]\nkind='range'\nanchors={1=[0,0,inf]}": "anchor '1' is at [0.0, 0.0, inf]",
-    "[sensors.a]\nkind='range'\nanchors={1=[0,0,0],0x1=[0,0,1]}": "anchor '0x1' is told twice",
+    "[sensors.a]\nkind='range'\nanchors={1=[0,0,0],0x1=[0,0,1]}": "anchor '0x1' is given twice",
     "[sensors.a]\nkind='pose'\ntarget_quaternion_xyzw=[0,0,0,0]": "target_quaternion_xyzw: a quaternion of norm 0",
     "[sensors.a": "cannot be read",
 }

@@ -1,4 +1,4 @@
-"""The chi-square distribution that every gate goes by."""
+"""The chi-square distribution that every gate uses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.special import chdtrc, gammaincinv  # `scipy.stats` has them too, thi
 
 
 def chi_square_limit(probability: float, degrees: int) -> float:
-    """Return the value that a chi-square variable of so many degrees of freedom stays below with this probability."""
+    """Return the value that a chi-square variable with `degrees` of freedom stays below with this probability."""
     return float(2.0 * gammaincinv(0.5 * degrees, probability))
 
 
@@ -18,5 +18,5 @@ def chi_square_limits(probability: float, degrees: NDArray[np.int64]) -> NDArray
 
 
 def chi_square_tail(value: float, degrees: int) -> float:
-    """Return the probability that a chi-square variable of so many degrees of freedom is above a value."""
+    """Return the probability that a chi-square variable with `degrees` of freedom is above a value."""
     return float(chdtrc(degrees, value))

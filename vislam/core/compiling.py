@@ -1,4 +1,4 @@
-"""Says it when numba compiles in front of somebody's eyes."""
+"""Reports when numba compiles while a user waits."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-_WORTH_SAYING_S = 1.0  # of CPU: a kernel or two for arguments that nobody had before are no reason to speak
+_WORTH_SAYING_S = 1.0  # of CPU: a kernel or two for new kinds of arguments are no reason for a message
 
 
 def on_compilation(say: Callable[[], None]) -> None:
@@ -26,13 +26,13 @@ def on_each_kernel(say: Callable[[str], None]) -> None:
 
 
 class _Each:
-    """Tells the names of what was compiled, but for numba's own functions."""
+    """Reports the names of what was compiled, but for numba's own functions."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
 
     def notify(self, event: Any) -> None:
-        """Take what numba tells."""
+        """Take an event of numba."""
         function = event.data["dispatcher"].py_func
         if event.is_end and function.__module__.startswith("vislam."):
             self._say(f"{function.__module__.removeprefix('vislam.')}.{function.__name__}")
@@ -46,7 +46,7 @@ class _Listener:
         self._depth, self._begun_s, self._before_s = 0, 0.0, 0.0
 
     def notify(self, event: Any) -> None:
-        """Take what numba tells."""
+        """Take an event of numba."""
         if self._say is None:
             return
         now_s = time.process_time()

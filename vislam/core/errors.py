@@ -1,4 +1,4 @@
-"""The errors a user of vislam can meet. Each message says what happened, where, asked versus got, and the next step."""
+"""The errors a user of vislam can meet. Each message has what happened, where, asked versus got, and the next step."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class TrackingLostError(VislamError):
 
 
 class HardwareError(VislamError):
-    """A sensor, bus or port does not answer as its datasheet says (exit code 5)."""
+    """A sensor, bus or port does not answer as its datasheet states (exit code 5)."""
 
     exit_code = 5
 

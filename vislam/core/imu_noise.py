@@ -28,9 +28,9 @@ class ImuNoise:
     accelerometer_scale_sigma: float | None = None
 
     def gap_s(self, told_s: float) -> float:
-        """Return how long a hole between samples is no outage: as told, and one and a half periods of a slow IMU.
+        """Return how long a hole between samples is no outage: as given, and one and a half periods of a slow IMU.
 
-        Not beyond half a second: what a body does between samples further apart, nobody has measured.
+        Not beyond half a second: what a body does between samples further apart is unmeasured.
         """
         usual_s = _USUAL_PERIODS / self.rate_hz if self.rate_hz > 0.0 else 0.0
         return max(told_s, usual_s) if usual_s <= _LONGEST_GAP_S else told_s

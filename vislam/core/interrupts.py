@@ -1,7 +1,7 @@
 """Ctrl-C, SIGTERM and the end of a terminal (SIGHUP): they end a process alike, and whatever it is doing.
 
 Python runs the handler of a signal between two of its own steps, so what the main thread has called, such as a compiler
-or a disk, keeps the handler waiting. A thread, which the system tells of each signal, ends the process after a while
+or a disk, keeps the handler waiting. A thread, which receives each signal, too, ends the process after a while
 where the main thread did not.
 """
 
@@ -94,7 +94,7 @@ def bounded() -> Iterator[None]:
 
 @contextmanager
 def counted() -> Iterator[Asked]:
-    """Count signals in place of raising KeyboardInterrupt; whoever counts looks at `count` now and then.
+    """Count signals in place of raising KeyboardInterrupt; the caller looks at `count` now and then.
 
     In a thread that is not the main one none is counted: there they raise in the main thread.
     """

@@ -16,7 +16,7 @@ from vislam.core.numba_internals import replace_internals
 
 
 def njit(**options: Any) -> Any:
-    """Return numba's decorator for compiled functions, without the entry for C, through which nobody calls."""
+    """Return numba's decorator for compiled functions, without the entry for C, which is never called."""
     return numba.njit(no_cfunc_wrapper=True, **options)
 
 

@@ -63,7 +63,7 @@ def private_folder() -> Path | None:
 
 
 def _passing_folder(place: Path) -> Path:
-    """Make a private folder of a new name for this process: somebody else has that of ours."""
+    """Make a private folder of a new name for this process: another user has that of ours."""
     import atexit
     import shutil
     import tempfile
@@ -80,7 +80,7 @@ def _passing_folder(place: Path) -> Path:
 
 
 def _is_private(folder: Path) -> bool:
-    """A folder of ours, no link, that nobody else can enter, and in which we can write."""
+    """A folder of ours, no link, that no other user can enter, and in which we can write."""
     status = folder.lstat()
     ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()
     return ours and stat.S_IMODE(status.st_mode) == _PRIVATE and os.access(folder, os.W_OK | os.X_OK)
@@ -105,7 +105,7 @@ def _set_by_hand() -> bool:
 def _home_is_ours() -> bool:
     """Whether numba's folder under the home can be written by us, and belongs to us: under sudo it can be another's."""
     cache = os.getenv("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))  # as numba finds it
-    if not os.path.isabs(cache):  # nobody knows a home: numba would make a folder '~' wherever it is started
+    if not os.path.isabs(cache):  # there is no home: numba would make a folder '~' wherever it is started
         return False
     folder = _nearest(Path(cache, "numba"))
     return folder.stat().st_uid == os.geteuid() and _can_write(folder)

@@ -10,7 +10,7 @@ from typing import Any
 def late(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
     """Return a `__getattr__` for a package that finds each name in the module that is its home.
 
-    Whoever needs one small module of a package does not pay for the import of all that its door gives.
+    A user of one small module of a package does not pay for the import of all that its door gives.
     """
 
     def find(name: str) -> Any:

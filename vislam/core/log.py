@@ -20,7 +20,7 @@ from vislam.core.revision import version
 
 FILE_NAME = "log.txt"
 LEVELS = ("debug", "info", "warning", "error")
-_OURS = logging.getLogger("vislam")  # other packages are asked for warnings only: numba tells its life at lower levels
+_OURS = logging.getLogger("vislam")  # other packages are asked for warnings only: numba logs a lot at lower levels
 _LOG = logging.getLogger(__name__)
 
 

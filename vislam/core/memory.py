@@ -109,7 +109,7 @@ class LoopPlace(StrEnum):
     PENDING = "pending"
     WAITING = "waiting"  # between submaps that are not joined
     OUT = "out"
-    UNDONE = "undone"  # taken out by somebody, after the run; it stays out until they bring it back
+    UNDONE = "undone"  # taken out by a user, after the run; it stays out until brought back
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +218,7 @@ class StartFacts:
     excitation_m_s2: float
     noise: ImuNoise  # the model that was used from then on
     first_state: NavState  # of keyframe 0
-    begun_t_ns: int = 0  # since when there are poses: provisional ones came before `last`; 0: not told
+    begun_t_ns: int = 0  # since when there are poses: provisional ones came before `last`; 0: unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,9 +262,9 @@ class SlamMemory:
     graph: GraphMemory
     places: PlacesMemory
     scans: dict[int, PackedScan]  # by keyframe
-    held: int = 0  # so many of the first keyframes belong to a map that is not to change
-    map_keyframes: int = 0  # so many of the first keyframes are those of earlier runs
-    T_guess: Array | None = None  # [4, 4] where the body is thought to be in that map when a recording begins; None
+    held: int = 0  # number of first keyframes that belong to a map that is not to change
+    map_keyframes: int = 0  # number of first keyframes that are of earlier runs
+    T_guess: Array | None = None  # [4, 4] where the body is assumed to be in that map when a recording begins; None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

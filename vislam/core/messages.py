@@ -102,7 +102,7 @@ class Observations:
     depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
     instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
-    noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are told
+    noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are given
 
     def __repr__(self) -> str:
         right = "" if self.right_px is None else f", {int(np.isfinite(self.right_px[:, 0]).sum())} in cam1"
@@ -125,7 +125,7 @@ class Frame:
     color: ImageU8 | None = None  # [H, W, 3] BGR of cam0
     depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
     tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
-    depth_lag_s: float = 0.0  # how much later than the images depth was taken, as its own stamp says
+    depth_lag_s: float = 0.0  # how much later than the images depth was taken, by its own stamp
 
     def __repr__(self) -> str:
         has = [f"{image.shape[1]} x {image.shape[0]} px" for image in self.images]

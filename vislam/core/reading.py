@@ -20,7 +20,7 @@ _MAX_TEXT_BYTES = 16 * 2**20  # settings, plans, calibrations
 
 def open_file(path: Path) -> BufferedReader:
     """Return a regular file, open for reading bytes. Raises OSError."""
-    # without O_NONBLOCK the call itself would wait for somebody to write into a FIFO
+    # without O_NONBLOCK the call itself would wait for a writer of a FIFO
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
         _check_mode(os.fstat(descriptor).st_mode, path)

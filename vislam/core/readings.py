@@ -11,12 +11,12 @@ from vislam.core.messages import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """What a sensor said at one time; what its numbers mean says the sensor (`vislam.sensors.Sensor`)."""
+    """What a sensor said at one time; what its numbers mean is defined by the sensor (`vislam.sensors.Sensor`)."""
 
     sensor: str  # its name in the configuration
     t_ns: int  # by the IMU's clock
     values: Array  # [C] as `Sensor.columns` has them
-    covariance: Array | None = None  # [m, m] of the residual as the device told it; None: what the sensor knows
+    covariance: Array | None = None  # [m, m] of the residual as the device stated it; None: what the sensor knows
 
 
 class OwnStart(NamedTuple):
@@ -36,9 +36,9 @@ class OwnNow(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Station:
-    """Where between two keyframes a reading was taken, as inertial data alone tell it: free of both poses.
+    """Where between two keyframes a reading was taken, as inertial data alone give it: free of both poses.
 
-    Motions are told in the axes of the body at the earlier keyframe, without gravity, as `imu.Preintegrated` has them.
+    Motions are given in the axes of the body at the earlier keyframe, without gravity, as `imu.Preintegrated` has them.
     Without an IMU they are those of a body that keeps its speed: no turn, and nothing gained.
     """
 

@@ -12,7 +12,7 @@ from vislam.core.geometry import so3_exp, transform
 from vislam.core.messages import Array
 
 UpSource = Literal["told", "accelerometer", "map", "floor", "planes", "camera", "unknown"]
-WORDS = ("auto", "camera", "none")  # of --up: find out; the first image's up is up; nobody knows
+WORDS = ("auto", "camera", "none")  # of --up: find out; the first image's up is up; unknown
 _LEAST_LENGTH = 1e-6  # of a vector with a direction
 _UNIT = 1e-6  # by how much the length of a stored direction may differ from one
 _SAME = 1e-9  # rad: directions that differ by less are one
@@ -23,9 +23,9 @@ class Up:
     """The direction of up, where it comes from and how sure that is.
 
     Attributes:
-        source: who says it; "unknown" where nobody does.
+        source: where it is from; "unknown" where there is none.
         direction: unit vector [3] in the frame in which the run was estimated; None where it is unknown.
-        sigma_deg: of the direction, one sigma about each horizontal axis; None where nobody can say.
+        sigma_deg: of the direction, one sigma about each horizontal axis; None where that is unknown.
         confidence: 0 to 1, that it is this direction and no other; 0 where it is unknown.
         reason: one sentence for people: what it is made of, or why it is not known.
     """
@@ -48,7 +48,7 @@ class Up:
 
     @classmethod
     def unknown(cls, reason: str) -> Up:
-        """Return that nobody knows, and why."""
+        """Return that it is unknown, and why."""
         return cls("unknown", None, None, 0.0, reason)
 
     @classmethod
@@ -73,7 +73,7 @@ class Up:
 
 
 def parse_up(text: str) -> Array | str:
-    """Return what `--up` says: one of the words of `WORDS`, or a unit vector [3] in the first camera's axes.
+    """Return what `--up` sets: one of the words of `WORDS`, or a unit vector [3] in the first camera's axes.
 
     Raises UsageError for anything else.
     """

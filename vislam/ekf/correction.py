@@ -1,4 +1,4 @@
-"""What one frame tells the filter: the same value for the filter beside vision and for one in another process."""
+"""What one frame gives the filter: the same value for the filter beside vision and for one in another process."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Hint:
 
 @dataclass(frozen=True, slots=True)
 class AppliedReading:
-    """What a sensor other than IMU and camera told, or first values of its own variables, and when that was."""
+    """What a sensor other than IMU and camera measured, or first values of its own variables, and when that was."""
 
     t_ns: int
     what: Reading | OwnStart

@@ -109,7 +109,7 @@ def imu_sigmas(config: EkfConfig, noise: ImuNoise) -> Array:
 
 
 def scaled(sigmas: Array, noise: NoiseScale) -> Array:
-    """Return `imu_sigmas` [6] with white noise so many times as large."""
+    """Return `imu_sigmas` [6] with white noise scaled by `noise`."""
     return sigmas * np.array([*noise, 1.0, 1.0, 1.0, 1.0])
 
 

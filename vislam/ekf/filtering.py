@@ -81,7 +81,7 @@ class Filtering:
         self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,
         shows_scale: bool, noise: SeenNoise,
     ) -> None:  # fmt: skip
-        """Take what was seen in a frame and what the IMU's noise is, and tell the filter what it is to know by now."""
+        """Take what was seen in a frame and what the IMU's noise is, and give the filter what it is to know by now."""
         if self._config.vision == "none":  # nor that the body rests: a camera has to agree to that
             vo = replace(vo, T_keyframe_body=None, tracking=Tracking.LOST)
             observations, at_rest, keyframe_id = no_observations(), False, None
@@ -97,22 +97,22 @@ class Filtering:
             self._applied.append(correction)
 
     def take_applied(self) -> list[Correction]:
-        """Return what the filter was told since this was asked last."""
+        """Return what was applied to the filter since the last call."""
         applied, self._applied = self._applied, []
         return applied
 
     def add_reading(self, reading: Reading) -> UpdateResult:
-        """Tell the filter at once what a sensor says; stamps are by the IMU's clock, and may be late."""
+        """Apply a reading of a sensor at once; stamps are by the IMU's clock, and may be late."""
         self._applied_readings.append(AppliedReading(reading.t_ns, reading))
         return self._applied_readings[-1].apply(self.ekf)
 
     def begin_sensor(self, t_ns: int, start: OwnStart) -> UpdateResult:
-        """Tell the filter first values of a sensor's own variables, which hold from `t_ns` on."""
+        """Give the filter first values of a sensor's own variables, which hold from `t_ns` on."""
         self._applied_readings.append(AppliedReading(t_ns, start))
         return self._applied_readings[-1].apply(self.ekf)
 
     def take_applied_readings(self) -> list[AppliedReading]:
-        """Return what the filter was told of other sensors since this was asked last, in that order."""
+        """Return what was applied of other sensors since the last call, in that order."""
         applied = list(self._applied_readings)
         self._applied_readings.clear()
         return applied

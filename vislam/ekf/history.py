@@ -20,7 +20,7 @@ class AtRest(NamedTuple):
 
 
 class KnownBias(NamedTuple):
-    """Biases of the IMU that somebody else found."""
+    """Biases of the IMU that were found elsewhere."""
 
     values: Array  # [12] gyro, accel, and their sigmas
 
@@ -54,7 +54,7 @@ class Outcome:
 class Event(Generic[M]):
     """A measurement, and what became of it the last time it was applied."""
 
-    t_ns: int  # by the clock of the sensor: the core says when that was by the IMU's
+    t_ns: int  # by the clock of the sensor: the core knows when that was by the IMU's
     # noise: from here on, over what the filter was made with
     measurement: M | AtRest | KnownBias | NoiseScale | Reading | OwnStart
     outcome: Outcome | None = None  # None while it waits for the IMU
@@ -78,7 +78,7 @@ class History(Generic[S, M]):
     """
 
     def __init__(self, first: Checkpoint[S], time_of: Callable[[Event[M], S], int]) -> None:
-        """Begin at a checkpoint; `time_of` tells when an event happened by the IMU's clock, as far as a state knows."""
+        """Begin at a checkpoint; `time_of` gives when an event happened by the IMU's clock, as far as a state knows."""
         self.checkpoints = [first]
         self._time_of = time_of
         self._events: list[Event[M]] = []

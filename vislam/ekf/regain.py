@@ -1,13 +1,13 @@
 """A sensor of places that the gate refuses although its readings agree: when the filter believes it again.
 
-What a filter was not told of (a gyro worse than its data sheet, a minute without sight) makes it surer than it is, and
+What a filter does not model (a gyro worse than its data sheet, a minute without sight) makes it surer than it is, and
 a gate then refuses good readings for ever. Autopilots take the newest after a time; here the refused readings have to
 earn it. One error of the filter must explain them all to within their own noise: of place, of velocity where there is
 one, and without sight of acceleration too, which is tilt. It must be one that the filter can have made since it last
 believed the sensor. And no other sensor of places, believed meanwhile, may contradict.
 
 Then the estimate moves by that error, clones and points with the body: of an error common to all, vision knows nothing.
-The covariance grows by how surely the readings tell it. A gate opened wide instead, with a usual update, would turn the
+The covariance grows by how surely the readings show it. A gate opened wide instead, with a usual update, would turn the
 covariance of an invariant filter about a far origin, and pass the move for knowledge of the heading.
 """
 
@@ -61,15 +61,15 @@ class Regain(NamedTuple):
     velocity_m_s: Array  # [3]; zero where it was not asked
     covariance: Array  # [6, 6] of both
     tilt_rad: float  # sigma; where there was no sight
-    afresh: bool  # what places and velocity say of the rest is forgotten: it was wrong by as much as they were
-    told: str = ""
+    afresh: bool  # what places and velocity imply of the rest is forgotten: it was wrong by as much as they were
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
     """What a filter remembers of all sensors, and of how long it had no sight; part of its state."""
 
-    start_ns: int = 0  # of the filter: of a sensor that nobody has heard of, drift counts from there
+    start_ns: int = 0  # of the filter: of a sensor without a reading yet, drift counts from there
     seen_ns: int = 0
     blind_ns: int = 0
     sensors: Mapping[str, Trust] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class Watch:
         if farthest_m <= 0.0 or not some or some[-1].t_ns != t_ns:
             return None
         since_s, blind_s = (t_ns - trust.accepted_ns) * 1e-9, (self.blind_until(t_ns) - trust.blind_ns) * 1e-9
-        # with sight the simplest error that explains them; without any nobody else knows velocity and tilt either
+        # with sight the simplest error that explains them; without any, velocity and tilt are unknown as well
         found = next((f for n in ((2,) if blind_s else (0, 1)) if (f := _common_error(some, n)) is not None), None)
         if found is None:
             return None
@@ -117,11 +117,11 @@ class Watch:
         distance_m = float(np.linalg.norm(found.place_m))
         if distance_m > min(drifted_m, farthest_m) or self._contradicted(name, some[0].t_ns, found.place_m):
             return None
-        told = (
+        text = (
             f"believed again: {len(some)} readings over {(t_ns - some[0].t_ns) * 1e-9:.1f} s agree that the place is "
             f"off by {distance_m:.2f} m, {since_s:.0f} s after the last that was believed"
         )
-        return found._replace(told=told)
+        return found._replace(text=text)
 
     def _contradicted(self, name: str, since_ns: int, off_m: Array) -> bool:
         others = (trust for other, trust in self.sensors.items() if other != name and trust.accepted_ns >= since_ns)
@@ -146,12 +146,12 @@ def grown(P: Array, regain: Regain, body: Array, places: Sequence[int], up: Arra
 
 
 def _bounds_drift(H: Array) -> bool:
-    """Whether a reading [m, 15] tells velocity along two axes at least."""
+    """Whether a reading [m, 15] shows velocity along two axes at least."""
     return bool(H.shape[0] >= 2 and np.linalg.matrix_rank(H[:, 6:9]) >= 2)
 
 
 def _enough(refused: tuple[Refused, ...]) -> tuple[Refused, ...]:
-    """Return the newest that are just enough to tell, none where there are fewer."""
+    """Return the newest that are just enough, none where there are fewer."""
     for count in range(_LEAST, len(refused) + 1):
         if refused[-1].t_ns - refused[-count].t_ns >= _LEAST_NS:
             return refused[-count:]

@@ -55,7 +55,7 @@ class SensedTimeline(Timeline[S, M]):
         return self._core.apply(state, Event(reading.t_ns, reading), self._rate_at(reading.t_ns), 0.0).accepted
 
     def own(self, name: str) -> tuple[Array, Array]:
-        """Return values [V] and sigmas [V] of a sensor's own variables now; before it begins, what it says of them.
+        """Return values [V] and sigmas [V] of a sensor's own variables now; before it begins, what it assumes of them.
 
         Raises KeyError for a sensor that is not there.
         """

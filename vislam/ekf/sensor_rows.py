@@ -68,7 +68,7 @@ class Sensing:
         """Return why a reading cannot be used; empty: it can."""
         try:
             return self.suite.why_unusable(reading)
-        except Exception as error:  # it is somebody else's code
+        except Exception as error:  # the code is a user's
             return f"the check of sensor {reading.sensor!r}: {type(error).__name__}: {error}"
 
     def why_no_start(self, start: OwnStart) -> str:
@@ -102,7 +102,7 @@ class Sensing:
             P[rows, rows] += self.suite.walks[at] ** 2 * ((t_ns - since_ns[name]) * 1e-9)
 
     def own(self, name: str, own: OwnVariables, t_ns: int) -> tuple[Array, Array]:
-        """Return a sensor's own values [V] and their covariance [V, V]; before it begins, what it says of them."""
+        """Return a sensor's own values [V] and their covariance [V, V]; before it begins, what it assumes of them."""
         at = self.suite.own(name)
         if name not in own.since_ns:
             return self.suite.starts[at].copy(), np.diag(self.suite.sigmas[at] ** 2)
@@ -115,7 +115,7 @@ class Sensing:
         name = reading.sensor
         if self.suite[name].variables and name not in own.since_ns:
             out.count(f"{name}_waiting")
-            out.reason = f"sensor {name!r} has not begun: nobody has set its own variables"
+            out.reason = f"sensor {name!r} has not begun: its own variables are not set"
             return None
         try:
             # a copy: no code of a sensor may change the state
@@ -139,7 +139,7 @@ class Sensing:
         return self._limits[key]
 
     def judge(self, name: str, nis: float, degrees: int, out: Outcome) -> bool:
-        """Write down what the gate says; return whether the reading passes."""
+        """Write down what the gate finds; return whether the reading passes."""
         limit, out.nis = self.limit(name, degrees), nis
         if nis <= limit:
             out.accept(f"{name}_accepted")
@@ -155,7 +155,7 @@ class Sensing:
         """Remember a reading that the gate refused; return also how to believe its sensor again, if that is time."""
         name = reading.sensor
         if not rows.H[:, 3:6].any():
-            return watch, None  # it says nothing of places
+            return watch, None  # it shows nothing of places
         watch = watch.refused(name, Refused(reading.t_ns, rows.H[:, 3:6], rows.residual))
         speed_m_s = float(np.linalg.norm(body.velocity_m_s))
         return watch, watch.regain(name, reading.t_ns, speed_m_s, self.suite[name].regain_m)
@@ -165,7 +165,7 @@ class Sensing:
         out.counts.pop(f"{name}_gated")
         out.accept(f"{name}_accepted")
         out.count(f"{name}_regained")
-        out.reason = f"{name} {regain.told}"
+        out.reason = f"{name} {regain.text}"
 
 
 def body_of(t_ns: int, x: Array, gyro_rad_s: Array) -> BodyState:

@@ -123,7 +123,7 @@ class Timeline(Generic[S, M]):
             self._run()
 
     def follow_noise(self, t_ns: int, scale: NoiseScale) -> UpdateResult:
-        """Take it that white noise is so many times that of the model from `t_ns` on: a ride shakes, a rest not."""
+        """Assume white noise of `scale` times the model's from `t_ns` on: a ride shakes, a rest not."""
         if not (np.isfinite(scale).all() and min(scale) > 0.0):
             return self._refuse("noise_invalid", "factors on noise must be finite and positive")
         return self._insert(Event(t_ns, scale))

@@ -16,7 +16,7 @@ _MAX_STEP_S = 0.1  # longer holes are bridged by as much
 
 
 class AttitudeFilter:
-    """Owns attitude and gyro bias; starts from what power-up found. `config.method` says how (`Vqf`, `Complementary`).
+    """Owns attitude and gyro bias; starts from what power-up found. `config.method`: `Vqf` or `Complementary`.
 
     Causal and without a clock: the answer depends on the samples alone. Samples that are not finite, or not newer than
     the last, are left out.

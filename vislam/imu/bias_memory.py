@@ -77,7 +77,7 @@ class BiasMemory:
         try:
             entries = [_entry(item) for item in read_json(path, _MAX_BYTES)["gyro_biases"]]
         except (OSError, ValueError, TypeError, KeyError) as error:
-            raise DataError(f"{path} holds no gyro biases ({error}); delete it to begin anew") from error
+            raise DataError(f"{path} holds no gyro biases ({error}); delete it to begin again") from error
         memory = BiasMemory(limit)
         for temperature_c, bias in entries:
             memory.add(temperature_c, bias)

@@ -26,7 +26,7 @@ class ImuBuffer:
     """
 
     def __init__(self, config: ImuConfig, machine: MachineConfig, noise: ImuNoise | None = None) -> None:
-        """Start empty; with a noise model the spans tell what the samples show against it."""
+        """Start empty; with a noise model the spans have what the samples show against it."""
         self.noise_floor = None if noise is None else NoiseFloor(noise)
         self.outages = 0
         self._series = ImuSeries()

@@ -49,7 +49,7 @@ class Magnetic(NamedTuple):
 
 
 def magnetic(config: AttitudeConfig) -> Magnetic:
-    """Return what the kernel goes by."""
+    """Return the kernel's parameters."""
     return Magnetic(
         _MAG_TAU_S, _MAG_FIELD_TAU_S, _MAG_REFERENCE_TAU_S, config.mag_gate,
         np.deg2rad(config.mag_dip_gate_deg), _MAG_UNDISTURBED_S, _MAG_NEW_S,
@@ -64,7 +64,7 @@ def begin_heading() -> Heading:
 
 @njit(cache=True, nogil=True)
 def hold_heading(state: Heading, seen: Array, rate_rad_s: float, dt_s: float, p: Magnetic) -> None:
-    """Take a field [3], seen in the level frame that the heading is told against; the first one has no dt_s."""
+    """Take a field [3], seen in the level frame in which the heading is given; the first one has no dt_s."""
     norm = np.sqrt(np.sum(seen * seen))
     if norm == 0.0:
         return

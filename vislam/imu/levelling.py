@@ -3,7 +3,7 @@
 Laidig and Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation and magnetic disturbance
 rejection", Information Fusion 91, 2023 (arXiv 2203.17024), sections 3.3 to 3.5. Other than there, steps may differ in
 length, the time constant grows while the body keeps its tilt, what rests must keep its tilt too, and the error of the
-tilt is told.
+tilt is reported.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Level(NamedTuple):
     rest_s: Array  # [1] since when it may be rest
     sway_rad_s: Array  # [1] how fast the tilt changed, its peaks slowly forgotten
     turning_rad_s: Array  # [3] low-passed rate of the smooth force in start, where gravity does not turn
-    wander_rad2: Array  # [1] variance per axis that it tells of
+    wander_rad2: Array  # [1] variance per axis that it shows
 
 
 class Levelling(NamedTuple):

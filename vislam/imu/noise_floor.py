@@ -23,14 +23,14 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import AS_MODELLED, Array, ImuSample, NoiseScale
 
 _WINDOW_S, _HOP_S = 1.0, 0.5  # resolves 2 Hz; half a second is short against how long a ride or a rest lasts
-_MOST_SAMPLES = 8192  # in a window, whatever rate is told: no IMU is faster
+_MOST_SAMPLES = 8192  # in a window, whatever rate is given: no IMU is faster
 _AVERAGED = 4  # windows; alone, the quietest band of a window is 20 % quieter than the noise, by chance
 _LOWEST_HZ = 3.0  # below, even slow machines move
 _HIGHEST_SHARE = 0.25  # of the rate; above, the low-pass filters of sensors take noise out that is there lower down
 _MOTION_HZ = 1.0  # where bodies that people, wheels and rotors move have most of their motion
 _CHANCE = 1.08  # how much the quietest of the averaged bands is below a flat spectrum, by simulation
 _SHAKEN = 10.0  # times the data sheet: usual in flight and on wheels
-_NEWS = 1.25  # a scale that moved by less is what was told
+_CHANGED = 1.25  # a scale that moved by less is the same
 _LONGEST_STEP = 2.5  # sample intervals; more is a hole
 _KEPT_S = 60.0  # of levels, for spans that are cut later; longer than any buffer
 
@@ -56,11 +56,11 @@ class SeenNoise:
 class NoiseFloor:
     """Owns the spectrum of the last seconds and the noise level that it showed so far.
 
-    The scale that estimators go by never falls below the model: a low-pass filter inside the sensor makes it look
+    The scale that estimators use never falls below the model: a low-pass filter inside the sensor makes it look
     quieter than it is.
 
     Attributes:
-        now: the scale since when, in steps of a quarter at least, so that a level that hovers is no news.
+        now: the scale since when, in steps of a quarter at least, so that a level that hovers is no change.
     """
 
     def __init__(self, noise: ImuNoise) -> None:
@@ -80,7 +80,7 @@ class NoiseFloor:
         self._motions: deque[Array] = deque(maxlen=_AVERAGED)  # [2] variance of rates and forces in a window
         self._floors: list[tuple[float, float]] = []  # density of gyro and accel over the model's, per window
         self.now = SeenNoise(0, AS_MODELLED)
-        self._told: deque[SeenNoise] = deque([self.now])
+        self._given: deque[SeenNoise] = deque([self.now])
 
     def add(self, sample: ImuSample) -> bool:
         """Take a sample and return whether the scale changed with it; a hole begins a new window."""
@@ -102,13 +102,13 @@ class NoiseFloor:
         return self._follow(int(self._times[left - 1]))
 
     def between(self, t0_ns: int, t1_ns: int) -> NoiseScale:
-        """Return the scale over a span of time: the root mean square of what was told."""
-        begins = [seen.t_ns for seen in self._told]
+        """Return the scale over a span of time: the root mean square of what was given out."""
+        begins = [seen.t_ns for seen in self._given]
         ends = [*begins[1:], t1_ns]
         lengths = [max(min(e, t1_ns) - max(b, t0_ns), 0) for b, e in zip(begins, ends, strict=True)]
         if sum(lengths) == 0:
-            return self._told[0].scale
-        squares = np.average([np.square(seen.scale) for seen in self._told], axis=0, weights=lengths)
+            return self._given[0].scale
+        squares = np.average([np.square(seen.scale) for seen in self._given], axis=0, weights=lengths)
         gyro, accel = np.sqrt(squares).tolist()
         return NoiseScale(gyro, accel)
 
@@ -122,7 +122,7 @@ class NoiseFloor:
         return NoiseRatios(float(quiet[0]), float(quiet[1]), float(typical[0]), float(typical[1]))
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Return the white noise densities that were told and those that the run showed, by sensor; empty before."""
+        """Return the white noise densities that were given and those that the run showed, by sensor; empty before."""
         ratios = self.ratios
         if ratios is None:
             return {}
@@ -130,8 +130,8 @@ class NoiseFloor:
         gyro = model.gyroscope_noise_density, ratios.gyro_quiet, ratios.gyro_typical, now.gyro
         accel = model.accelerometer_noise_density, ratios.accel_quiet, ratios.accel_typical, now.accel
         return {
-            name: {"told": told, "quietest": told * quiet, "typical": told * typical, "used_last": told * last}
-            for name, (told, quiet, typical, last) in (("gyro", gyro), ("accel", accel))
+            name: {"told": given, "quietest": given * quiet, "typical": given * typical, "used_last": given * last}
+            for name, (given, quiet, typical, last) in (("gyro", gyro), ("accel", accel))
         }
 
     def at_least_seen(self) -> ImuNoise:
@@ -148,7 +148,7 @@ class NoiseFloor:
     def warnings(self, tolerance: float) -> list[str]:
         """Return what a user should know: a model that is `tolerance` times too large, or small beyond all vibration.
 
-        A machine that shakes has ten times the noise of a data sheet, and estimators go by it: that is no fault.
+        A machine that shakes has ten times the noise of a data sheet, and estimators use it: that is no fault.
         """
         ratios = self.ratios
         if ratios is None:
@@ -182,7 +182,7 @@ class NoiseFloor:
         self._spectra.append(np.array([[power[b, :3].mean(), power[b, 3:].mean()] for b in self._bands]))
 
     def _follow(self, newest_t_ns: int) -> bool:
-        """Return whether the floor, as the last windows or the newest alone show it, is news."""
+        """Return whether the floor, as the last windows or the newest alone show it, has changed."""
         quietest = np.maximum(np.mean(self._spectra, axis=0).min(axis=0), self._spectra[-1].min(axis=0))
         model = np.maximum(
             [self._model.gyroscope_noise_density, self._model.accelerometer_noise_density], np.finfo(float).tiny
@@ -192,14 +192,14 @@ class NoiseFloor:
         by_motion = self._scale_sigmas**2 * np.mean(self._motions, axis=0) / (2.0 * _MOTION_HZ) / model**2
         gyro, accel = np.sqrt(np.maximum([gyro, accel], 1.0) ** 2 + by_motion).tolist()
         old = self.now.scale
-        scale = NoiseScale(_told(old.gyro, gyro), _told(old.accel, accel))
+        scale = NoiseScale(_followed(old.gyro, gyro), _followed(old.accel, accel))
         if scale == old:
             return False
-        is_first = len(self._floors) == 1  # it also says what was before
+        is_first = len(self._floors) == 1  # it also holds for what was before
         self.now = SeenNoise(0 if is_first else newest_t_ns - round(_HOP_S * 1e9), scale)
-        self._told.append(self.now)
-        while len(self._told) > 1 and newest_t_ns - self._told[1].t_ns > _KEPT_S * 1e9:
-            self._told.popleft()
+        self._given.append(self.now)
+        while len(self._given) > 1 and newest_t_ns - self._given[1].t_ns > _KEPT_S * 1e9:
+            self._given.popleft()
         return True
 
 
@@ -213,5 +213,5 @@ def _bands(size: int, rate_hz: float) -> list[NDArray[np.bool_]]:
     return [mask for mask in masks if mask.any()]
 
 
-def _told(old: float, new: float) -> float:
-    return old if 1.0 / _NEWS < new / old < _NEWS else new
+def _followed(old: float, new: float) -> float:
+    return old if 1.0 / _CHANGED < new / old < _CHANGED else new

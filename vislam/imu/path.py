@@ -1,4 +1,4 @@
-"""What a whole recording of inertial samples says of a body's path: attitude and position, integrated."""
+"""What a whole recording of inertial samples shows of a body's path: attitude and position, integrated."""
 
 from __future__ import annotations
 

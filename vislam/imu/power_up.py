@@ -25,7 +25,7 @@ _MAX_STEP_S = 0.1  # a hole in which the cart may have moved
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PowerUp:
-    """What standing still told."""
+    """What standing still has shown."""
 
     t_ns: int  # end of the window
     gyro_bias_rad_s: Array  # [3]
@@ -53,8 +53,8 @@ def power_up(
 ) -> PowerUp | Refusal:
     """Take the newest `config.window_s` of a span as rest, or say why they are not.
 
-    An even turn looks like a bias; it is told from one by what the gyro is remembered to have at this temperature.
-    What is horizontal here is what gravity says; vision needs the tilt against the floor, which on a slope is not it.
+    An even turn looks like a bias; it is distinguished by what the gyro is remembered to have at this temperature.
+    Horizontal is by gravity here; vision needs the tilt against the floor, which on a slope is not it.
     """
     t_s = (span.t_ns - span.t_ns[-1]) * _NS
     inside = t_s >= -config.window_s - 0.5 * _MAX_STEP_S

@@ -1,4 +1,4 @@
-"""Rest detection from inertial statistics; the caller combines it with what the image says."""
+"""Rest detection from inertial statistics; the caller combines it with what the image shows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def still_limits(config: InitConfig, noise: ImuNoise, scale: NoiseScale = AS_MOD
 class RestDetector:
     """Decides whether the sensor has been still for `config.rest_s`: low spread of rate and force, low mean rate.
 
-    An IMU alone cannot tell rest from uniform straight motion; ask the image too (median disparity below
+    An IMU alone cannot distinguish rest from uniform straight motion; ask the image too (median disparity below
     `config.still_px`), as OpenVINS does for its zero-velocity update. A smooth start spreads force little and shifts
     far walls little for a second; the speed that it gains, integrated against the force of the rest before, shows it.
     """
@@ -86,7 +86,7 @@ class RestDetector:
         self._force = self._force + dt_s / self._force_s * (span.accel_m_s2.mean(axis=0) - self._force)
 
     def _sets_off(self, span: ImuSpan) -> bool:
-        """Return whether the speed gained over a span says that the rest before it is over."""
+        """Return whether the speed gained over a span shows that the rest before it is over."""
         dt_s = float(span.t_ns[-1] - span.t_ns[0]) / _NS
         if self._force_s < self._config.rest_s:  # what was before is known less well than what came
             return False

@@ -74,7 +74,7 @@ def rest_accel_bias(span: ImuSpan, gravity_m_s2: float, config: InitConfig) -> A
 def rest_covariance(span: ImuSpan, R: Array, gravity_m_s2: float, config: InitConfig, noise: ImuNoise) -> Array:
     """Return the covariance [15, 15] of a state at rest with attitude R [3, 3].
 
-    Tilt and accelerometer bias cannot be told apart; their correlation says so.
+    Tilt and accelerometer bias cannot be separated, which their correlation expresses.
     """
     rested_s = (int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS
     sigma_gyro = np.sqrt(rest_variance(span.gyro_rad_s, rested_s)) + noise.gyroscope_noise_density

@@ -11,7 +11,7 @@ from vislam.core.messages import Array
 from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD, about_up
 from vislam.sensors.sensor import Begun, Variable
 
-_ROUNDS = 15  # of weighing anew: a tenth of wild points lose their say within five
+_ROUNDS = 15  # of reweighing: a tenth of wild points lose their weight within five
 _CAUCHY = 2.385  # sigmas at which a point has half its weight; 95 % efficient on normal noise
 _FEWEST = 5  # points: four numbers are asked, and a wild point has to show
 _CLEAR = 3.0  # sigmas of a point by which the path is spread, however many points lie at one place
@@ -21,7 +21,7 @@ _MOST_SCALE = 3.0  # the points then do not lie on this path
 def aligned_frame(world_m: Array, frame_m: Array, variances_m2: Array) -> Begun | None:
     """Return T_frame_world as yaw, x, y, z of points [N, 3] in the world and in the frame; None: too early to say.
 
-    The heading that fits best is closed form (Horn 1987, in the plane), the points weighed anew by how well they fit
+    The heading that fits best is closed form (Horn 1987, in the plane), the points reweighed by how well they fit
     (Cauchy), so that wild ones do not count. Sigmas come from the points' variances [N, 2] (horizontal per axis, up),
     raised by as much as the points fit worse than that. A heading with a sigma above 5 deg is too early, and so is a
     path spread by less than three sigmas of one point: errors of neighbouring points are often alike.

@@ -1,4 +1,4 @@
-"""The body as a sensor sees it: pose, velocity, rate and biases at one time, whoever estimates them."""
+"""The body as a sensor sees it: pose, velocity, rate and biases at one time, by any estimator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A reading as a linear system at an estimate; whatever is wrong with a sensor's own code is told by its name here."""
+"""A reading as a linear system at an estimate; errors of a sensor's own code are reported by its name here."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def linearised(sensor: Sensor, reading: Reading, body: BodyState, own: Array) ->
             raise ValueError("numbers that are not finite")
         if not (np.diag(linear.noise) > 0.0).all():
             raise ValueError("noise without a positive variance of every number")
-    except Exception as error:  # it is somebody else's code
+    except Exception as error:  # the code is a user's
         raise SensorError(f"sensor {reading.sensor!r} at {reading.t_ns} ns: {type(error).__name__}: {error}") from error
     return linear
 
@@ -56,7 +56,7 @@ def linearised(sensor: Sensor, reading: Reading, body: BodyState, own: Array) ->
 def derived(
     sensor: Sensor, values: Array, body: BodyState, own: Array, residual: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return H [m, 15] and H_own [m, V] by differences of the residual, which is as given where somebody knows it [m].
+    """Return H [m, 15] and H_own [m, V] by differences of the residual, which is as given where it is known [m].
 
     Forward ones, for they cost half as much as central ones: a residual whose second derivative is 1 gets a first one
     that is off by half the step, 5e-7. That moves no estimate by anything near its sigma.

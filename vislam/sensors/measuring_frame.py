@@ -22,7 +22,7 @@ from vislam.sensors.sensor import Variable
 FrameKind = Literal["own", "known"]
 ANYWHERE_M = 1e4  # sigma of a place nothing is known of: beyond it a local frame is none; larger costs digits
 ENOUGH_YAW_RAD = math.radians(5.0)  # sigma of a heading from which on a linear step is good
-MOST_READINGS = 200  # that are compared at a start: more of the same path tell little, and are asked again and again
+MOST_READINGS = 200  # that are compared at a start: more of the same path add little, and are compared again and again
 UP: Array = np.array([0.0, 0.0, 1.0])
 _T = TypeVar("_T")
 

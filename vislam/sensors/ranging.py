@@ -48,7 +48,7 @@ class _Solution(NamedTuple):
 
 
 def ranged_frame(seen: Ranges, prior: Prior) -> Begun | None:
-    """Return T_frame_world as yaw, x, y, z and the bias, with sigmas; None: too early, or not to be told apart.
+    """Return T_frame_world as yaw, x, y, z and the bias, with sigmas; None: too early, or ambiguous.
 
     Gauss-Newton with Huber's weights from eight headings, and above and below the anchors. Refused are solutions that
     another one, such as a mirrored one, fits nearly as well; that are not sure of heading (5 deg) or place (a tenth
@@ -143,7 +143,7 @@ def _differs(one: _Solution, best: _Solution, sigmas: Array) -> bool:
 
 
 def _is_round(best: _Solution, covariance: Array, seen: Ranges, prior: Prior) -> bool:
-    """Return whether the cost rises around a solution as its covariance says; in a valley that bends it does not."""
+    """Return whether the cost rises around a solution by its covariance; in a valley that bends it does not."""
     lengths, directions = np.linalg.eigh(covariance)
     for step in (_FAR * np.sqrt(np.maximum(lengths, 0.0)) * directions).T:
         if not step.any():

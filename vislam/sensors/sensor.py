@@ -67,7 +67,7 @@ class Sensor(ABC):
 
     @abstractmethod
     def noise(self, values: Array) -> Array:
-        """Return the covariance [m, m] of the residual of a reading, where the device tells none."""
+        """Return the covariance [m, m] of the residual of a reading, where the device states none."""
 
     def jacobians(self, values: Array, body: BodyState, own: Array) -> tuple[Array, Array] | None:
         """Return what the residual hangs on: H [m, 15] and H_own [m, V] with `residual ~ H @ error + H_own @ error`.

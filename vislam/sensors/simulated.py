@@ -24,7 +24,7 @@ class Faults:
     stuck: Spans = ()  # the last values again and again
     slips: Spans = ()  # wheels turn faster than they roll
     slip_share: float = 0.5  # by so much
-    slip_columns: tuple[str, ...] = ()  # of one wheel; empty: of all that the sensor says can slip
+    slip_columns: tuple[str, ...] = ()  # of one wheel; empty: of all columns of the sensor that can slip
     outliers: float = 0.0  # probability of a reading of a body that is elsewhere and moves otherwise
     outlier_m: float = 10.0  # sigma per axis of how far off; 0.1 of it in m/s, and 0.1 of it in rad about each axis
     backward: float = 0.0  # probability of a stamp before that of the last reading
@@ -84,7 +84,7 @@ def within(since_s: float, spans: Spans) -> bool:
 
 
 def _elsewhere(body: BodyState, sigma_m: float, rng: np.random.Generator) -> BodyState:
-    """Return a body that has nothing to do with this one, as a wild reading tells of."""
+    """Return a body that has nothing to do with this one, as a wild reading shows."""
     return replace(
         body,
         R_world_body=body.R_world_body @ so3_exp(0.1 * sigma_m * rng.normal(size=3)),

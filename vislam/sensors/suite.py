@@ -12,7 +12,7 @@ from vislam.sensors.sensor import Sensor
 
 
 class Suite:
-    """Sensors by name, in the order in which they were told."""
+    """Sensors by name, in the order in which they were given."""
 
     def __init__(self, sensors: Mapping[str, Sensor] | None = None) -> None:
         """Take the sensors; without any nothing changes anywhere."""

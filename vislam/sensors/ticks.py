@@ -18,7 +18,7 @@ class TicksSettings:
     bits: Literal[8, 16, 32, 64] = 32  # of the counter, which rolls over
     left_sign: Literal[1, -1] = 1  # -1: counts fall when it goes forward
     right_sign: Literal[1, -1] = 1
-    max_gap_s: Positive = 1.0  # between counts; over a longer one a speed says little
+    max_gap_s: Positive = 1.0  # between counts; over a longer one a speed means little
     max_m_s: Positive = 20.0  # more is a counter that was reset
 
 
@@ -54,6 +54,6 @@ class TickSpeeds:
 
 
 def counted(difference: int, bits: int) -> int:
-    """Return by how much a counter of so many bits moved: the way round that is shorter."""
+    """Return by how much a counter of `bits` bits moved: the way round that is shorter."""
     half = 1 << (bits - 1)
     return (difference + half) % (2 * half) - half

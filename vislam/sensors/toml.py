@@ -28,7 +28,7 @@ _MOST_BYTES = 2**20
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 FileFormat = Literal["csv", "nmea", "ubx", "bag", "gpmf"]
 BRIDGE = "bridge"  # in place of a port: the board that has the IMU
-_FIX_DELAY_S = 0.05  # from a fix's time to a receiver's first byte, unless it is told
+_FIX_DELAY_S = 0.05  # from a fix's time to a receiver's first byte, unless it is given
 _FIX_COLUMNS = ("east_m", "north_m", "up_m")
 _FORMATS: dict[str, FileFormat] = {  # all else is a table
     ".nmea": "nmea", ".ubx": "ubx", ".bag": "bag", ".mcap": "bag", ".db3": "bag",
@@ -51,7 +51,7 @@ class _Common:
 
     kind: str
     file: str = ""  # beside the TOML file; empty: readings come from elsewhere
-    format: FileFormat | None = None  # None: by the file's ending; a bag where a topic is told
+    format: FileFormat | None = None  # None: by the file's ending; a bag where a topic is given
     topic: str = ""  # of a bag
     joints: JointsSettings | None = None  # of a bag's joint states
     simulated_hz: NonNegative = 0.0  # above 0, and without a file, readings are drawn on the truth of a recording
@@ -94,7 +94,7 @@ class SensorPort:
 
     @property
     def at_bridge(self) -> bool:
-        """Whether it is plugged into the serial bridge, which passes on what it says."""
+        """Whether it is plugged into the serial bridge, which passes on its bytes."""
         return self.port == BRIDGE
 
 
@@ -108,7 +108,7 @@ class SensorSetup:
     simulated_hz: Mapping[str, float]  # of those whose readings are drawn
     simulated_faults: Mapping[str, Faults]  # of the same
     ports: Mapping[str, SensorPort]  # of those that are read live
-    datums: Mapping[str, Geodetic]  # of those that are told where on the earth their frame begins
+    datums: Mapping[str, Geodetic]  # of those whose frame's place on the earth is given
 
 
 def load_sensor_setup(path: Path) -> SensorSetup:
@@ -229,7 +229,7 @@ def _port(common: _Common, sensor: Configured, where: str) -> SensorPort | None:
                 f"receiver on (format nmea or ubx); kind {common.kind} wants a port of its own"
             )
         if common.baud is not None:
-            raise UsageError(f"{where}: option baud: at the bridge it is told in the sketch, as GNSS_BAUD")
+            raise UsageError(f"{where}: option baud: at the bridge it is set in the sketch, as GNSS_BAUD")
     baud = common.baud or (115_200 if format_ == "csv" else 9600)
     told_s = common.delay_s
     delay_s = told_s if told_s is not None else 0.0 if format_ == "csv" else _FIX_DELAY_S

@@ -16,14 +16,14 @@ from vislam.core.trajectory import Trajectory
 from vislam.trajectory.evaluation import associate
 
 _HALF_WINDOW_NS = 150_000_000  # of the fit that gives true velocities: 1 mm of noise at 200 Hz becomes 4 mm/s
-_MAX_HALF_WINDOW_NS = 500_000_000  # a rarer truth says nothing about velocity
+_MAX_HALF_WINDOW_NS = 500_000_000  # a rarer truth has no velocity
 _MIN_SAMPLES = 10  # of the truth in the window, for four coefficients
 _REACH = 0.6  # of half the window, on both sides
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """The average of a chi-square statistic per degree of freedom: 1 when the covariance tells the truth."""
+    """The average of a chi-square statistic per degree of freedom: 1 when the covariance is right."""
 
     mean: float  # per degree of freedom
     low: float  # 95 % of consistent estimators lie between low and high, if their errors were independent
@@ -149,7 +149,7 @@ def _heading_rad(R: Array) -> float:
 def _velocities(truth: Trajectory, t_ns: NDArray[np.int64]) -> tuple[Array, Array]:
     """Return true velocities [N, 3], NaN near the ends and holes of the truth, and their variances [N].
 
-    A cubic in time is fitted to the true positions around each time; what it leaves over tells the noise of the truth.
+    A cubic in time is fitted to the true positions around each time; what it leaves over shows the noise of the truth.
     """
     period_ns = float(np.median(np.diff(truth.t_ns))) if len(truth) > 1 else np.inf
     half_ns = max(_HALF_WINDOW_NS, 0.5 * _MIN_SAMPLES * period_ns)

@@ -1,9 +1,9 @@
 """The pose that is published: it follows the estimate and takes corrections in as the body moves, not as jumps.
 
-An estimator corrects itself whenever a measurement comes in: the pose of one instant is suddenly another one. Whoever
+An estimator corrects itself whenever a measurement comes in: the pose of one instant is suddenly another one. What
 steers by it takes that for motion. Here the published pose goes on as the body does, and what is still to be corrected
 is let go gradually: with the way and the turn that the body makes, and slowly in time. So at rest next to nothing
-moves, and while it moves a correction looks like an odometry that errs by so many percent for a while. A correction
+moves, and while it moves a correction looks like an odometry that errs by some percent for a while. A correction
 that is too large for that comes at once, for it is another belief about the place, not a better one.
 
 Position and rotation are kept apart: a turn of the frame moves the body where it turns it, not at a lever arm.
@@ -55,8 +55,8 @@ class Continuity:
             t_ns: of the estimate.
             T_before: [4, 4] the estimate as it was before what came in with this call, carried on to `t_ns`.
             T_after: [4, 4] the estimate of the same instant now.
-            rate_sigma_rad_s: how well the body's rate of turn is known: what the gyroscope may drift, nobody sees.
-                Infinite: vision alone tells it, which errs with the turn.
+            rate_sigma_rad_s: how well the body's rate of turn is known: the gyroscope's drift is unseen.
+                Infinite: vision alone measures it, which errs with the turn.
         """
         if self._t_ns is not None:
             self._let_go(max(t_ns - self._t_ns, 0) / _NS, T_before, rate_sigma_rad_s)

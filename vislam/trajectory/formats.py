@@ -84,7 +84,7 @@ def read_euroc(path: Path) -> Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM or EuRoC trajectory file, told apart by the comma in its first line of data."""
+    """Read a TUM or EuRoC trajectory file, distinguished by the comma in its first line of data."""
     for _, line in _data_lines(path):
         return read_euroc(path) if "," in line else read_tum(path)
     raise DataError(f"{path} holds no poses")

@@ -17,11 +17,11 @@ from vislam.core.up import Up
 
 _GRAVITY_M_S2 = 9.81
 _UNITS_M_S2 = {"m/s^2": 1.0, "g": _GRAVITY_M_S2, "cm/s^2": 0.01}
-_NORM_RANGE = (0.7, 1.3)  # of gravity: the median norm tells the unit, also of a poor sensor in motion
+_NORM_RANGE = (0.7, 1.3)  # of gravity: the median norm shows the unit, also of a poor sensor in motion
 _MOST = 5000  # samples that are looked at
 _LEAST = 20
 _LEAST_S = 2.0  # of recording: a hand's swing takes about one second
-_BIAS_SIGMA_M_S2 = 0.5  # of a cheap chip that nobody calibrated (50 mg)
+_BIAS_SIGMA_M_S2 = 0.5  # of a cheap chip without calibration (50 mg)
 _SCALE_SIGMA = 0.03
 _KERNEL_M_S2 = 1.0  # Cauchy's; hands accelerate by so much
 _CORRELATED_S = 0.25  # samples nearer than this err alike: they belong to one move of the hand
@@ -31,7 +31,7 @@ _MOST_SIGMA_DEG = 5.0
 
 
 def up_of_forces(trajectory: Trajectory, t_ns: NDArray[np.int64], forces: Array) -> Up:
-    """Return which way is up by specific forces at rest and in motion; unknown where they do not tell.
+    """Return which way is up by specific forces at rest and in motion; unknown where they do not show it.
 
     Args:
         trajectory: of the body in the map.
@@ -56,7 +56,7 @@ def up_of_forces(trajectory: Trajectory, t_ns: NDArray[np.int64], forces: Array)
 
 
 def _unknown(reason: str) -> Up:
-    return Up.unknown(f"the accelerometer does not tell: {reason}")
+    return Up.unknown(f"the accelerometer does not show it: {reason}")
 
 
 def _unit(norm: float) -> str | None:

@@ -76,7 +76,7 @@ class WaitingKeyframes:
 
 
 def _restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
-    """Return the packet `shift_ns` later in the IMU's time; its inertial data have to be cut anew."""
+    """Return the packet `shift_ns` later in the IMU's time; its inertial data have to be cut again."""
     keyframe, t_ns = packet.keyframe, packet.keyframe.t_ns + shift_ns
     return replace(
         packet,
@@ -89,7 +89,7 @@ def _restamped(packet: KeyframePacket, shift_ns: int) -> KeyframePacket:
 def first_keyframe_state(first: NavState, keyframe: OdometryKeyframe) -> NavState:
     """Return the state of the first keyframe, given the state of the first frame that the initialisation used.
 
-    If that frame came later, the keyframe's velocity is unknown, and its covariance says so.
+    If that frame came later, the keyframe's velocity is unknown, and its covariance is large.
     """
     t_ns = keyframe.packet.keyframe.t_ns
     if first.t_ns == t_ns:

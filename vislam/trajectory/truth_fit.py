@@ -1,8 +1,8 @@
 """How a true trajectory fits the IMU of its recording: what its body is turned and displaced, what its clock is off.
 
-Motion capture tells the pose of markers. Where they are on the body was calibrated once, and is off by some tenths of
-a degree; its clock is another one. The gyroscope tells the turn: a body frame that is turned against the IMU's shows as
-an error that turns with the body, while a gyroscope's drift stays in the world and is slow. The accelerometer tells the
+Motion capture gives the pose of markers. Where they are on the body was calibrated once, and is off by some tenths of
+a degree; its clock is another one. The gyroscope shows the turn: a body frame that is turned against the IMU's shows as
+an error that turns with the body, while a gyroscope's drift stays in the world and is slow. The accelerometer shows the
 rest: twice integrated over half a second on either side of a time, it must bend the path as the positions bend.
 Over seconds, not from pose to pose, since the truth of some recordings was smoothed with their own inertial data.
 
@@ -34,7 +34,7 @@ _TURN_EVERY_S, _PLACE_EVERY_S = 0.1, 0.04  # true poses that are looked at
 _ARM_S = 0.5  # of the bend of the path, to either side: in less, a smoothed truth is the IMU again
 _SHORT_ARM_S = 0.25  # at which a lever must be the same, while errors of attitude and accelerometer are not
 _MAX_IMU_GAP_S = 0.03  # over longer gaps the body may do anything
-_MIN_POSES, _MIN_SPAN_S = 40, 5.0  # fewer tell nothing
+_MIN_POSES, _MIN_SPAN_S = 40, 5.0  # fewer show nothing
 _BLOCK_S, _MIN_BLOCKS = 10.0, 12  # pieces whose errors are independent
 _GRAVITY_M_S2 = 9.81
 _MEDIAN_OF_CHI3 = 1.538

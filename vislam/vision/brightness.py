@@ -1,7 +1,7 @@
 """Exposure that changed between two images: gain and offset of grey, seen where the same patches are expected.
 
 Lucas-Kanade compares grey levels as they are, so a step of exposure takes every track from it. The middle one of many
-patches tells the step even where each is expected some pixels off; what is clipped tells nothing and is left out. A
+patches shows the step even where each is expected some pixels off; what is clipped shows nothing and is left out. A
 gamma curve turns a factor of exposure into another factor of grey, so the same line serves cameras that apply one.
 """
 
@@ -15,16 +15,16 @@ from vislam.core.messages import Array, ImageU8
 from vislam.core.quantiles import quantile
 
 _NEGLIGIBLE = 1.3  # ratio of brightness; less, and Lucas-Kanade stands it better than a gain known to some percent
-_MIN_PATCHES = 10  # that tell the same; fewer are no evidence
-_MAX_PATCHES = 120  # looked at; the middle one of so many is known to a few percent
+_MIN_PATCHES = 10  # that agree; fewer are no evidence
+_MAX_PATCHES = 120  # looked at; the middle one of this many is known to a few percent
 _SAMPLES = 7  # a patch is seen through 7 x 7 pixels spread over it
-_CLIPPED = (3, 252)  # grey levels beyond which a camera no longer tells light apart, noise allowed for
+_CLIPPED = (3, 252)  # grey levels beyond which a camera no longer distinguishes light, noise allowed for
 _MAX_CLIPPED = 5  # of the 49 samples
 _FLAT_GREY = 2.0  # standard deviation below which a patch has no contrast to compare
 
 
 def matched(source: ImageU8, target: ImageU8, pixels: Array, guess: Array, window_px: int) -> ImageU8:
-    """Return `source` as bright as `target`; the same object, untouched, where they are alike or it cannot be told.
+    """Return `source` as bright as `target`; the same object, untouched, where they are alike or it cannot be found.
 
     Args:
         source: grey image whose patches are looked for.

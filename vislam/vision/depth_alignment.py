@@ -4,7 +4,7 @@ Points are associated by projection and drawn to the planes they fall on, coarse
 al., ISMAR 2011; point to plane: Chen and Medioni 1992), under robust weights and noise that grows with z^2. A start has
 to be known: this does not search.
 
-What depth does not tell is kept as the prior has it. A bare wall slides in two directions and turns in one; normals
+What depth does not show is kept as the prior has it. A bare wall slides in two directions and turns in one; normals
 that are noisy look as if they held it (Gelfand et al., 3DIM 2003: unstable directions; Zhang et al., ICRA 2016: to be
 left alone). How much information noise alone would make up is summed up beside the information itself, so directions
 count as determined only where they hold several times as much.
@@ -232,7 +232,7 @@ def _accumulate(
 def _determined(sums: _Sums) -> tuple[Array, Array, Array]:
     """Return information [6, 6] and gradient [6] of the directions that depth determines, and a basis of the others.
 
-    Information is what is more than noise makes up, over how much the residuals are larger than told, alone or together
+    Information is what is more than noise makes up, over how much the residuals exceed their sigmas, alone or together
     in a region of the image (see `refine.pose_covariance`).
     """
     scale = np.sqrt(np.trace(sums.made_up[:3, :3]) / max(np.trace(sums.made_up[3:, 3:]), 1e-12))
@@ -256,7 +256,7 @@ def _determined(sums: _Sums) -> tuple[Array, Array, Array]:
 def _judged(frame: DepthSurface, model: Sequence[SeenFrom], T: Array) -> tuple[float, float, float]:
     """Return overlap, agreement and the share seen through, of the frame at T [4, 4] and the model."""
     rows = _rows(frame, _LOOK)
-    best, through, told = np.zeros(len(rows.points)), 0, 0
+    best, through, judged = np.zeros(len(rows.points)), 0, 0
     for part in model:
         T_part_cam = np.ascontiguousarray(invert(part.T_model_cam) @ T)
         codes = _compared(rows.points, part.seen, T_part_cam)
@@ -264,10 +264,10 @@ def _judged(frame: DepthSurface, model: Sequence[SeenFrom], T: Array) -> tuple[f
         back = _rows(part.seen, _LOOK).points
         codes_back = _compared(back, frame, np.ascontiguousarray(invert(T_part_cam)))
         through += int((codes_back == 1.0).sum())
-        told += int((codes_back > 0.0).sum())
+        judged += int((codes_back > 0.0).sum())
     on, in_front = int((best == 2.0).sum()), int((best == 1.0).sum())
-    through, told = through + in_front, told + on + in_front
-    return on / max(len(best), 1), on / max(on + in_front, 1), through / max(told, 1)
+    through, judged = through + in_front, judged + on + in_front
+    return on / max(len(best), 1), on / max(on + in_front, 1), through / max(judged, 1)
 
 
 def _compared(points: Array, seen: DepthSurface, T_seen_cam: Array) -> Array:

@@ -144,12 +144,12 @@ def align_edges(frames: Sequence[FrameEnds]) -> EdgeAlignment | None:
     means = summed.mean(axis=(-1, -2)).sum(axis=1)
     by_offset, by_lag = by_offset / means[:, None], by_lag / means.sum()
     contrast = float(by_lag.max())
-    told = (
+    is_found = (
         contrast - float(by_lag.min()) > _LEAST_FALL * (contrast - 1.0) and 0 < int(by_lag.argmax()) < len(by_lag) - 1
     )
     step = np.array([_OFFSETS_PX[1] - _OFFSETS_PX[0]] * 2 + [_LAGS_S[1] - _LAGS_S[0]])
     sigma = np.hypot(again.std(axis=0), step / np.sqrt(12.0))
-    if not told:  # the image hardly moves: any lag would do
+    if not is_found:  # the image hardly moves: any lag would do
         found[2], sigma[2] = 0.0, np.inf
     return EdgeAlignment(
         found[:2], sigma[:2], float(found[2]), float(sigma[2]), int(count.sum()), contrast, by_offset, _OFFSETS_PX,

@@ -1,6 +1,6 @@
 """The focal length that makes points with depth in two views move as one rigid body.
 
-Depth says how far points are, the focal length how far apart they are sideways; a turn of the camera exchanges the two.
+Depth is how far points are, the focal length how far apart they are sideways; a turn of the camera exchanges the two.
 Over many pairs of views, Gauss-Newton finds the poses, and beside them what all pairs share: the focal length, the
 readout of a rolling shutter (a camera that pans would else seem to zoom), and what the edges left open of the place
 and the lag of depth, as priors. The errors are in pixels: in units of the focal length they would shrink as it grows,

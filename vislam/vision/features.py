@@ -40,7 +40,7 @@ class FlowSettings:
     iterations: int = 30
     epsilon_px: float = 0.01  # stopped earlier, corners stay short on the side of the guess
     back_iterations: int = 10
-    back_epsilon_px: float = 0.1  # the way back only has to tell right from wrong
+    back_epsilon_px: float = 0.1  # the way back only has to separate right from wrong
 
 
 def detect_corners(

@@ -20,7 +20,7 @@ _CONFIDENCE = 0.999
 def pnp(points_m: Array, xy: Array, threshold: float, search: Any = None) -> tuple[Array, int] | None:
     """Return T_cam_points [4, 4] of a camera that sees points [N, 3] at `xy` [N, 2] on z = 1, and how many agree.
 
-    `threshold` is a distance on that plane; rows with NaN are ignored. `search` says how RANSAC searches, see `usac`;
+    `threshold` is a distance on that plane; rows with NaN are ignored. `search` sets how RANSAC searches, see `usac`;
     by default it is OpenCV's plain one, with P3P. None when there is no pose.
     """
     usable = np.isfinite(points_m).all(axis=1) & np.isfinite(xy).all(axis=1)

@@ -10,7 +10,7 @@ _CONFIDENCE = 0.999
 
 
 def usac(threshold: float, tries: int, seed: int, local_tries: int | None = None) -> Any:
-    """Return OpenCV's settings for an inlier's `threshold` on z = 1 and at most so many tries.
+    """Return OpenCV's settings for an inlier's `threshold` on z = 1 and a largest number of tries.
 
     `local_tries` refine each new best one; None leaves OpenCV's number.
     """

@@ -35,7 +35,7 @@ class PoseEstimate:
     inliers: NDArray[np.bool_]  # [N] within the gate
     variance: float  # robust variance of the whitened residuals: 1 when the noise model is right
     converged: bool
-    information: Array  # [6, 6] of that perturbation, for the noise that was told
+    information: Array  # [6, 6] of that perturbation, for the noise that was given
 
 
 class _Sightings(NamedTuple):

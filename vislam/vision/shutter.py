@@ -40,7 +40,7 @@ class Shutter:
 
     @property
     def sigma_s(self) -> float:
-        """How well the readout is known, in seconds: told ones and global shutters are.
+        """How well the readout is known, in seconds: given ones and global shutters are.
 
         Velocities that an estimate rests on are wrong in the same way in frame after frame, so that frames do not make
         it better than one of them: on fr1_desk it stays 10 ms below what its truth shows.

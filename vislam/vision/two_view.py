@@ -40,7 +40,7 @@ class TwoViewEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationPrior:
-    """What the gyroscope says of the rotation since the keyframe, once its bias is known."""
+    """What the gyroscope shows of the rotation since the keyframe, once its bias is known."""
 
     R_key_cam: Array  # [3, 3]
     sigma_rad: float

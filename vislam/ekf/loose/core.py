@@ -207,7 +207,7 @@ class LooseCore:
         return replace(ledger, clone_id=keyframe_id, T_odom_keyframe=T_odom_keyframe)
 
     def _place_keyframe(self, state: LooseState, vo: VoMeasurement) -> None:
-        """Put the clone where `vo` says its keyframe is, with the uncertainty of the body and of `vo`."""
+        """Put the clone where its keyframe is by `vo`, with the uncertainty of the body and of `vo`."""
         assert vo.T_keyframe_body is not None
         T_body = kernels.pose(state.x, 0, 6)
         T_body_keyframe = invert(vo.T_keyframe_body)

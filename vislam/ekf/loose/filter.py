@@ -8,7 +8,7 @@ pose after every loss of vision; where there is no observation the correction is
 Corrections are those of an invariant filter, which heading and position need to stay consistent (`kernels.correct`).
 By default `odom` is continuous: a metric motion corrects where the body is against its keyframe, not where the keyframe
 is. With `odom = "corrected"` all that is learned moves the past too: the best estimate, in larger steps. Directions do
-so always, for without scale the past is as long as what is learned later says.
+so always, for without scale the past is as long as what is learned later makes it.
 Measurements may come late and in any order: the filter goes back to their time and runs forward again, so the answer
 depends only on the set of measurements, not on when they came.
 """
@@ -46,7 +46,7 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
 
         Args:
             config: see `EkfConfig`.
-            noise: of the IMU, until `follow_noise` tells what the samples show.
+            noise: of the IMU, until `follow_noise` gives what the samples show.
             machine: gravity is down in `odom`; slip, axle and floor are used by `update_nonholonomic`.
             T_body_camera: [4, 4]; its lever arm turns a direction seen by one camera into motion of the body.
                 None: camera and IMU coincide. Not used for metric visual odometry.
@@ -146,11 +146,11 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
         (self.update_zero_velocity if hint.at_rest else self.update_nonholonomic)(hint.t_ns)
 
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:
-        """Tell the filter that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""
+        """Assume that the body is at rest at `t_ns`: zero velocity, and the gyro shows its bias."""
         return self._insert(Event(t_ns, AtRest()))
 
     def update_nonholonomic(self, t_ns: int) -> UpdateResult:
-        """Tell the filter that a cart's axle goes neither sideways nor up at `t_ns`, and that its floor is level.
+        """Assume that a cart's axle goes neither sideways nor up at `t_ns`, and that its floor is level.
 
         See `machine.slip_sigma_m_s`, `machine.axle_m` and `machine.floor_sigma_m`. Ten times a second is enough: slip
         goes on for a while, and more of the same would be taken for new evidence.

@@ -96,7 +96,7 @@ def predict(
 
 @njit(cache=True, nogil=True)
 def _step(x: Array, P: Array, step: Step, sigmas: Array, gravity: float, work: Array) -> None:
-    """Do what `predict` says. `work` [2, 9, 21 + K]: scratch, all zero at first, for many steps."""
+    """Predict, as `predict` documents. `work` [2, 9, 21 + K]: scratch, all zero at first, for many steps."""
     rate0, rate1, dt, gap_s = step
     wx = (0.5 * (rate0[0] + rate1[0]) - x[13]) * dt
     wy = (0.5 * (rate0[1] + rate1[1]) - x[14]) * dt
@@ -211,7 +211,7 @@ def predict_run(
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
         pieces = pieces_of(dt, gaps_s[k])
         for j in range(pieces):
-            if pieces == 1:  # not even rounding may tell this from a single `predict`
+            if pieces == 1:  # not even rounding may distinguish this from a single `predict`
                 _step(x, P, Step(samples[k - 1], samples[k], dt, gaps_s[k]), sigmas, gravity, work)
                 break
             between(samples[k - 1], samples[k], j / pieces, before)
@@ -227,7 +227,7 @@ def correct(x: Array, P: Array, K: Array, H: Array, noise: Array, residual: Arra
     The correction is that of the right-invariant error (Barrau and Bonnabel, "The invariant extended Kalman filter as a
     stable observer", IEEE TAC 2017): rotation, position and velocity move along the group SE_2(3), and P, though kept
     in the error of `NavState`, is carried to the new state so that the invariant error keeps its covariance. What
-    vision and gravity cannot tell, heading and position, then stays untold however often the state is corrected.
+    vision and gravity cannot show, heading and position, then stays unknown however often the state is corrected.
     """
     G = np.eye(len(P))  # from the error about the old state to that about the new
     _move_all(x, K @ residual, G)

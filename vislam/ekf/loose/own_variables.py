@@ -26,7 +26,7 @@ def begin(sensing: Sensing, state: LooseState, start: OwnStart, t_ns: int, out: 
 def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gyro_rad_s: Array, out: Outcome) -> None:
     """Correct a state in place by a reading, unless its gate refuses it.
 
-    The past moves as well, also where `odom` is continuous: a reading may tell where in `odom` the body is, and that is
+    The past moves as well, also where `odom` is continuous: a reading may show where in `odom` the body is, and that is
     no business of the clone.
     """
     name = reading.sensor

@@ -97,14 +97,14 @@ def relative_motion(
 
     Args:
         x: nominal state [23 + K].
-        P: covariance [21 + K, 21 + K]; how far the camera moved is only as well known as this says.
+        P: covariance [21 + K, 21 + K]; how far the camera moved is only as well known as by this.
         T: [4, 4] from the keyframe that is cloned to the body; without scale its translation is a unit direction, or 0.
         covariance: [6, 6] of T, on its body side, inflated.
         has_scale: whether the translation is in metres.
         lever_m: camera in the body frame [3]; only matters without scale.
 
     Returns:
-        The measurement, and by how many metres it is impossible whatever the gate says: moved against the direction.
+        The measurement, and by how many metres it is impossible whatever the gate decides: moved against the direction.
     """
     T_clone, T_body = pose(x, 16, 19), pose(x, 0, 6)
     direction = T[:3, 3].copy()

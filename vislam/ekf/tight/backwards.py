@@ -2,7 +2,7 @@
 
 Seen from its end a motion is a motion, too: with time reversed, velocities and rates of turn change their signs, forces
 and gravity do not. So what a filter needs to go on from a state takes it to the time before that state just as well,
-with scale, and with a covariance that says how well. A state found late gives metres to what vision saw until then.
+with scale, and with a covariance of its own. A state found late gives metres to what vision saw until then.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Sighting:
 
 
 class EarlyFrames:
-    """Owns what frames saw while there was no state, and tells where they were once there is one."""
+    """Owns what frames saw while there was no state, and finds where they were once there is one."""
 
     def __init__(self, config: EkfConfig, rig: Rig, machine: MachineConfig) -> None:
         """Start empty; see `states_before`."""
@@ -49,7 +49,7 @@ class EarlyFrames:
         self._seen.append(Sighting(t_ns, replace(observations, descriptors=None), at_rest))
 
     def forget(self) -> None:
-        """Forget all frames: nobody will ask."""
+        """Forget all frames: they are not needed any more."""
         self._seen.clear()
 
     def restamp(self, shift_ns: int) -> None:
@@ -144,5 +144,5 @@ def _mirrored(state: NavState, mirror_ns: int) -> NavState:
 
 
 def _motion(t_ns: int, seen: Observations) -> VoMeasurement:
-    """Return what tells the filter only that a frame was tracked."""
+    """Return what shows the filter only that a frame was tracked."""
     return VoMeasurement(t_ns, 0, np.eye(4), np.eye(6), False, Tracking.OK, len(seen.track_ids))

@@ -2,7 +2,7 @@
 
 One observation is a row [15]: direction x, y on z = 1; d(pixel)/d(x, y) [2, 2] by rows; the same six numbers for the
 right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read; its standard deviations
-over those told. NaN where not measured.
+over those given. NaN where not measured.
 Residuals are whitened: left pixels; right minus left pixels (matching left to right is better than following a corner
 over time, and both share the error of the corner); inverse depth.
 """
@@ -23,7 +23,7 @@ COLUMNS = 15
 ROWS_MAX = 5  # of one observation
 _STEPS = 10
 _CONVERGED = 1e-4  # of the cost
-_FAR_RHO = 1e-3  # 1/m: no parallax tells such points from infinity
+_FAR_RHO = 1e-3  # 1/m: no parallax distinguishes such points from infinity
 _NEAR_RHO = 20.0  # 1/m
 _KERNEL = 3.0  # Cauchy, in standard deviations, while the point is found
 

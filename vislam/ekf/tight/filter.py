@@ -41,7 +41,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
 
         Args:
             config: see `EkfConfig`.
-            noise: of the IMU, until `follow_noise` tells what the samples show.
+            noise: of the IMU, until `follow_noise` gives what the samples show.
             machine: gravity is down in `odom`.
             rig: cameras; observations may also hold right pixels (two cameras) or depth.
             suite: sensors other than IMU and camera; None: there are none.
@@ -96,7 +96,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         return UpdateResult(True, float("nan"), "")
 
     def update_vision(self, vo: VoMeasurement, observations: Observations, shows_scale: bool = True) -> UpdateResult:
-        """Take the tracks of a frame; its motion only says when it was and whether vision is lost.
+        """Take the tracks of a frame; its motion only has its time and whether vision is lost.
 
         `nis` of the result is that of all rows used, after compression. A frame may use nothing, since tracks are used
         when they end or have been followed through the whole window. No new point is kept in the state while the motion
@@ -124,5 +124,5 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         """Leave out what holds the body while the camera sees nothing: rest is an event of frames here."""
 
     def update_zero_velocity(self, t_ns: int) -> UpdateResult:
-        """Tell the filter that the body is at rest at a frame: no velocity, and the pose where rest began."""
+        """Assume that the body is at rest at a frame: no velocity, and the pose where rest began."""
         return self._insert(Event(t_ns, AtRest()))

@@ -6,7 +6,7 @@ right-invariant, in world axes: `R = Exp(e) R^`, `p = Exp(e) p^ + e_p`, `v = Exp
 what cannot be observed (yaw and position) is the same direction for every estimate, so the filter cannot gain
 information on it by moving its linearisation point: no first-estimates Jacobians are needed. Barrau and Bonnabel,
 "An EKF-SLAM algorithm with consistency properties", 2015; Wu et al., "An invariant-EKF VINS algorithm for improving
-consistency", IROS 2017. The bias of the accelerometer is told in body axes, which breaks this for the tilt of a body
+consistency", IROS 2017. The bias of the accelerometer is given in body axes, which breaks this for the tilt of a body
 at rest, whose other half that bias is: see `state.Rest`.
 """
 
@@ -160,7 +160,7 @@ def run(moving: Inertial, piece: Stretch, track: Array, sigmas: Array, gravity: 
         dt = (t_ns[k] - t_ns[k - 1]) * 1e-9
         pieces = pieces_of(dt, gaps_s[k])
         for j in range(pieces):
-            if pieces == 1:  # not even rounding may tell this from a single `step`
+            if pieces == 1:  # not even rounding may distinguish this from a single `step`
                 step(moving, Step(samples[k - 1], samples[k], dt, gaps_s[k]), sigmas, gravity, to_first)
                 break
             between(samples[k - 1], samples[k], j / pieces, before)

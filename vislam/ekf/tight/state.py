@@ -90,7 +90,7 @@ class Window:
 def propagated(window: Window, Phi: Array, Q: Array) -> Window:
     """Return the window after the inertial part went through the transition Phi with noise Q [15, 15].
 
-    Points stand still, but their error is told relative to the body's rotation error, and that changed. Own variables
+    Points stand still, but their error is given relative to the body's rotation error, and that changed. Own variables
     of sensors stand still.
     """
     first, end = window.first_point, window.first_own
@@ -124,7 +124,7 @@ def _skews(points: Array) -> Array:
 
 
 def _opened(P: Array, at: int, by: int) -> Array:
-    """Return P with room for so many rows and columns, which hold anything."""
+    """Return P with room for `by` more rows and columns from `at` on, which hold anything."""
     out = np.empty((len(P) + by, len(P) + by))
     out[:at, :at], out[:at, at + by :] = P[:at, :at], P[:at, at:]
     out[at + by :, :at], out[at + by :, at + by :] = P[at:, :at], P[at:, at:]
@@ -132,7 +132,7 @@ def _opened(P: Array, at: int, by: int) -> Array:
 
 
 def _closed(P: Array, at: int, by: int) -> Array:
-    """Return P without so many rows and columns."""
+    """Return P without `by` rows and columns from `at` on."""
     out = np.empty((len(P) - by, len(P) - by))
     out[:at, :at], out[:at, at:] = P[:at, :at], P[:at, at + by :]
     out[at:, :at], out[at:, at:] = P[at + by :, :at], P[at + by :, at + by :]

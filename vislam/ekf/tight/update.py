@@ -166,7 +166,7 @@ class FrameUpdater:
         return 0 if window.frames[0].t_ns != began_t_ns else 1
 
     def _rows(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
-        """Return what the newest frame says of its points of the state, and the tracks that are ripe with it.
+        """Return what the newest frame shows of its points of the state, and the tracks that are ripe with it.
 
         The window is where to linearise; its covariance is that before the frame, `change` [n] what lies between.
         """
@@ -206,9 +206,9 @@ class FrameUpdater:
         width = visible.stop - visible.start
         if not len(ripe.ids):
             nothing = np.zeros(0)
-            nobody = np.zeros(0, dtype=np.int64)
+            no_ids = np.zeros(0, dtype=np.int64)
             return _Rows(
-                np.zeros((0, n)), nothing, nobody, nobody, nobody, nobody, np.zeros((0, 3)), nothing,
+                np.zeros((0, n)), nothing, no_ids, no_ids, no_ids, no_ids, np.zeros((0, 3)), nothing,
                 np.zeros((0, 3, width + 1)), np.zeros((0, 3, 3)),
             )  # fmt: skip
         views = self._views(window, ripe.at, seen_at(window.frames, ripe.at, ripe.row))

@@ -54,7 +54,7 @@ class RequestReader:
         return self._take(end + 1)
 
     def read(self, count: int) -> bytes:
-        """Return `size` bytes of a body, fewer at the end of the stream; raises as `readline`."""
+        """Return `count` bytes of a body, fewer at the end of the stream; raises as `readline`."""
         if count > MOST_BODY_BYTES:
             raise TooLarge
         while len(self._pending) < count and self._fill():

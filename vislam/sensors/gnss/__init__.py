@@ -1,4 +1,4 @@
-"""Fixes of satellite receivers, as NMEA and UBX tell them, and the readings they make."""
+"""Fixes of satellite receivers, as NMEA and UBX give them, and the readings they make."""
 
 from vislam.sensors.gnss.fixes import FIX_KINDS, Fix, FixReadings, GnssSettings
 from vislam.sensors.gnss.nmea import NmeaFixes

@@ -20,10 +20,10 @@ FIX_KINDS: tuple[FixKind, ...] = ("none", "single", "differential", "float", "rt
 class Fix:
     """What a receiver said of one time."""
 
-    t_ns: int  # of UTC since 1970, or the stamp of whoever wrote it down
+    t_ns: int  # of UTC since 1970, or the stamp of the program that recorded it
     place: Geodetic
     kind: FixKind
-    sigma_m: float = math.nan  # per horizontal axis; nan: untold
+    sigma_m: float = math.nan  # per horizontal axis; nan: not stated
     sigma_up_m: float = math.nan
     hdop: float = math.nan
 
@@ -38,9 +38,9 @@ class GnssSettings:
     differential_m: Positive = 1.0
     float_m: Positive = 0.4
     rtk_m: Positive = 0.02
-    up_factor: Positive = 2.0  # heights are worse by so much
-    least_sigma_m: Positive = 0.01  # of a receiver that says less: neighbouring fixes share their errors
-    inflation: Positive = 1.0  # of what the receiver says
+    up_factor: Positive = 2.0  # by which heights are worse
+    least_sigma_m: Positive = 0.01  # of a receiver that states less: neighbouring fixes share their errors
+    inflation: Positive = 1.0  # of what the receiver states
     max_sigma_m: NonNegative = 30.0  # fixes less sure are refused
 
 

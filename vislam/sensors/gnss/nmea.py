@@ -14,7 +14,7 @@ from vislam.sensors.gnss.fixes import Fix, FixKind
 _QUALITY: dict[str, FixKind] = {"1": "single", "2": "differential", "3": "single", "4": "rtk", "5": "float"}
 _DAY_NS = 86_400_000_000_000
 _EPOCH = date(1970, 1, 1)
-_MOST_CHARACTERS = 256  # the standard says 82; some receivers write longer ones
+_MOST_CHARACTERS = 256  # the standard has 82; some receivers write longer ones
 
 
 @dataclass(slots=True)
@@ -22,7 +22,7 @@ class _Epoch:
     """What the sentences of one time say."""
 
     of_day_ns: int
-    stamp_ns: int | None = None  # of whoever wrote the line down
+    stamp_ns: int | None = None  # of the program that recorded the line
     place: Geodetic | None = None
     kind: FixKind = "none"
     hdop: float = math.nan
@@ -38,7 +38,7 @@ class NmeaFixes:
         self._epoch: _Epoch | None = None
         self._day: date | None = None
         self._last_of_day_ns: int | None = None
-        self.undated = 0  # fixes that nobody gave a date
+        self.undated = 0  # fixes without a date
 
     def feed(self, line: str) -> Fix | None:
         """Return the fix that a line ends, by being of another time. Raises ValueError for a damaged sentence."""
@@ -98,8 +98,8 @@ def _take(epoch: _Epoch, kind: str, fields: list[str], stamp_ns: int | None) -> 
 
 def _checked(rest: str) -> str:
     """Return what stands between `$` and `*`, if the checksum after it is right."""
-    body, star, told = rest.strip().rpartition("*")
-    if not star or len(told) != 2 or int(told, 16) != reduce(xor, body.encode("utf-8"), 0):
+    body, star, checksum = rest.strip().rpartition("*")
+    if not star or len(checksum) != 2 or int(checksum, 16) != reduce(xor, body.encode("utf-8"), 0):
         raise ValueError("checksum")
     return body
 

@@ -16,7 +16,7 @@ from vislam.sensors.kinds.driven import NO_TURN, Compared, Driven
 from vislam.sensors.mounting import Mount
 from vislam.sensors.sensor import Variable
 
-_LEAST_TURN = 1e-3  # rad/s; at rest no angle tells a turn, and a variance has to be positive
+_LEAST_TURN = 1e-3  # rad/s; at rest no angle shows a turn, and a variance has to be positive
 _MOST_STEERING_RAD = 1.4  # beyond it no wheel rolls
 
 
@@ -73,9 +73,9 @@ class Ackermann(Driven):
         return Compared(np.array([values[0] - expected, -motion[1], -motion[2], turn - motion[3]]), by_motion, by_own)
 
     def noise(self, values: Array) -> Array:
-        """Return the covariance [4, 4]; that of the angle counts by the speed that is told."""
+        """Return the covariance [4, 4]; that of the angle counts by the given speed."""
         s = self.settings
-        speed, steering = np.diag(self._told_noise(values))
+        speed, steering = np.diag(self._noise_at(values))
         by_angle = values[0] * (1.0 + math.tan(values[1] + s.steering_offset_rad) ** 2) / s.wheelbase_m
         turn = by_angle**2 * steering + s.gyro_rad_s**2 + _LEAST_TURN**2
         return np.diag([speed, s.sideways_m_s**2, s.upward_m_s**2, turn])
@@ -92,8 +92,8 @@ class Ackermann(Driven):
         moves = abs(motion[0]) > 1e-6
         steering = math.atan(motion[3] * self.settings.wheelbase_m / motion[0]) if moves else 0.0
         exact = np.array([motion[0] / own[0], steering - own[1]])
-        return noisy(exact, self._told_noise(exact), rng)
+        return noisy(exact, self._noise_at(exact), rng)
 
-    def _told_noise(self, values: Array) -> Array:
+    def _noise_at(self, values: Array) -> Array:
         s = self.settings
         return np.diag([s.sigma_m_s**2 + (s.slip * values[0]) ** 2, s.sigma_steering_rad**2])

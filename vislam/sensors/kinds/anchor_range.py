@@ -1,4 +1,4 @@
-"""Ranges to anchors, as ultra-wide band tells them."""
+"""Ranges to anchors, as ultra-wide band measures them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class AnchorRangeSettings:
     sigma_m: Positive = 0.1
     anchor_sigma_m: NonNegative = 0.0  # above 0 the anchors' places are estimated
     frame: FrameKind = "own"  # "known": anchors are in the world already
-    frame_z_m: Finite = 0.0  # of the world's origin in the anchors' frame: ranges in one plane do not tell it
+    frame_z_m: Finite = 0.0  # of the world's origin in the anchors' frame: ranges in one plane do not show it
     frame_z_sigma_m: Positive = ANYWHERE_M
     lever_m: Vector3 = (0.0, 0.0, 0.0)  # of the antenna in the body
     lever_sigma_m: NonNegative = 0.0  # above 0 it is estimated
@@ -114,7 +114,7 @@ class AnchorRange(Configured):
         return "" if values[1] >= 0.0 else f"a negative range, {values[1]:g} m"
 
     def begin(self, readings: Sequence[Reading], bodies: Sequence[BodyState]) -> Begun | None:
-        """Return the anchors' frame once ranges along the path tell it from its mirror images."""
+        """Return the anchors' frame once ranges along the path distinguish it from its mirror images."""
         usual = super().begin(readings, bodies)
         if not self._frame or usual is None:
             return usual
@@ -150,8 +150,8 @@ class AnchorRange(Configured):
     def about(self, path_m: Array, own: Array) -> Array:
         """Return own variables with a frame in which the middle of the path is at the middle of the anchors.
 
-        By their sigmas alone the path would be ten kilometres off, where all ranges are alike and tell no heading. Its
-        height is kept where it is told, and else the world's origin is at that of the frame.
+        By their sigmas alone the path would be ten kilometres off, where all ranges are alike and show no heading. Its
+        height is kept where it is given, and else the world's origin is at that of the frame.
         """
         if not self._frame:
             return own
@@ -189,7 +189,7 @@ def _numbered(anchors: Mapping[str, Vector3]) -> dict[int, Array]:
         except ValueError:
             raise UsageError(f"anchor {name!r} has to be a number, such as 7 or 0x1a") from None
         if number in numbered or not 0 <= number < 2**53:
-            raise UsageError(f"anchor {name!r} is told twice, or its number is negative or above 2^53")
+            raise UsageError(f"anchor {name!r} is given twice, or its number is negative or above 2^53")
         if not all(map(math.isfinite, place)):
             raise UsageError(f"anchor {name!r} is at {list(place)}; a finite place [x, y, z] in metres is asked")
         numbered[number] = np.array(place, dtype=np.float64)

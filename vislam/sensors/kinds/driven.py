@@ -1,4 +1,4 @@
-"""What all that drives shares: a base that goes forward, not sideways and not up, and turns as the gyroscope says."""
+"""What all that drives shares: a base that goes forward, not sideways and not up, and turns as the gyroscope has it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Compared(NamedTuple):
 
 
 class Driven(Configured):
-    """Residual [4] of a base that goes where it looks: what the device says, and no motion sideways or up.
+    """Residual [4] of a base that goes where it looks: what the device measures, and no motion sideways or up.
 
-    What the device says is compared with what the body's motion lets expect, and never scaled itself: its noise would
+    The device's value is compared with the one expected by the body's motion, and never scaled itself: its noise would
     else make scales and widths too small. The body's rate is the gyroscope's, so wheels that turn otherwise fail the
     gate as a whole; what slips by less is in the noise, which grows with speed and turn.
     """

@@ -1,4 +1,4 @@
-"""Poses that somebody else knows: motion capture, tags at known places, another SLAM, an odometry of its own."""
+"""Poses from elsewhere: motion capture, tags at known places, another SLAM, an odometry of its own."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ class Pose(GivenPose):
 
 
 class Odometry(GivenPose):
-    """A pose in a frame that drifts: what it tells is the motion between any two times, the surer the closer they are.
+    """A pose in a frame that drifts: it measures the motion between any two times, the surer the closer they are.
 
     Translation and heading of the frame walk. Its roll and pitch do not; what they drift by belongs into `sigma_rad`.
     """

@@ -23,7 +23,7 @@ class HeadingSettings:
 
     sigma_rad: Positive = 0.05
     clockwise: bool = False  # as compasses count; False: from x to y, as everything here
-    offset_rad: Finite = 0.0  # heading that is told when the body's x axis is the world's
+    offset_rad: Finite = 0.0  # heading that is measured when the body's x axis is the world's
     offset_sigma_rad: Positive = math.pi  # the world's heading is arbitrary
     offset_walk_rad_per_sqrt_s: NonNegative = 0.0
 
@@ -31,7 +31,7 @@ class HeadingSettings:
 class Heading(Configured):
     """The heading of the body's x axis against a direction that is estimated.
 
-    A body whose x axis points nearly up or down has none: the reading then says nothing.
+    A body whose x axis points nearly up or down has none: the reading then has no effect.
     """
 
     Settings = HeadingSettings

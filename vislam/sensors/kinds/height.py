@@ -1,4 +1,4 @@
-"""Heights, as a barometer tells them: good from minute to minute, with an offset that walks with the weather."""
+"""Heights, as a barometer measures them: good from minute to minute, with an offset that walks with the weather."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class HeightSettings:
     """Settings of `height`."""
 
     sigma_m: Positive = 0.3  # from reading to reading: 3 Pa
-    offset_m: Finite = 0.0  # height that is told at the world's origin
+    offset_m: Finite = 0.0  # height that is measured at the world's origin
     offset_sigma_m: Positive = ANYWHERE_M
     offset_walk_m_per_sqrt_s: NonNegative = 0.01  # 0.6 m in an hour of changing weather
     lever_m: Vector3 = (0.0, 0.0, 0.0)  # of the sensor in the body

@@ -35,7 +35,7 @@ class MagneticFieldSettings:
 class MagneticField(Configured):
     """The field in the body's axes: one vector of the world, which is estimated, and what the body's own iron adds.
 
-    The world's heading is arbitrary, so the field's direction is not told but found; from then on it holds heading.
+    The world's heading is arbitrary, so the field's direction is not given but found; from then on it holds heading.
     """
 
     Settings = MagneticFieldSettings
@@ -69,7 +69,7 @@ class MagneticField(Configured):
         return self.settings.sigma_ut**2 * np.eye(3)
 
     def begin(self, readings: Sequence[Reading], bodies: Sequence[BodyState]) -> Begun | None:
-        """Return the field as the first reading has it where none is told, and as little known as before.
+        """Return the field as the first reading has it where none is given, and as little known as before.
 
         It is only where to be linear: at a field of zero a reading would not tie heading and field together.
         """

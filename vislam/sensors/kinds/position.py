@@ -29,7 +29,7 @@ from vislam.sensors.sensor import Begun
 class PositionSettings:
     """Settings of `position`."""
 
-    sigma_m: Positive = 1.5  # per horizontal axis, where the device tells none: one frequency under an open sky
+    sigma_m: Positive = 1.5  # per horizontal axis, where the device states none: one frequency under an open sky
     sigma_up_m: Positive = 3.0
     frame: FrameKind = "own"  # "known": positions are in the world already
     lever_m: Vector3 = (0.0, 0.0, 0.0)  # of the antenna in the body

@@ -1,4 +1,4 @@
-"""Velocities that another odometry tells in the base's axes."""
+"""Velocities of another odometry in the base's axes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TwistSettings:
 
     scale_sigma: Positive = 0.03  # of the speed
     turn_scale_sigma: Positive = 0.03  # of the rate
-    base_m: Vector3 = (0.0, 0.0, 0.0)  # in the body, the point whose velocity is told
+    base_m: Vector3 = (0.0, 0.0, 0.0)  # in the body, the point whose velocity is measured
     mount_rpy_rad: Vector3 = NO_TURN  # roll, pitch, yaw of the base in the body
     mount_sigma_rad: NonNegative = 0.0  # above 0 its yaw and pitch are estimated
     sigma_m_s: Positive = 0.03
@@ -36,7 +36,7 @@ class TwistSettings:
 
 
 class Omni(Driven):
-    """Forward and left velocity and rate of a base that goes any way: `true = scale * told`."""
+    """Forward and left velocity and rate of a base that goes any way: `true = scale * measured`."""
 
     Settings = TwistSettings
     columns: ClassVar[tuple[str, ...]] = ("vx_m_s", "vy_m_s", "wz_rad_s")
@@ -64,20 +64,20 @@ class Omni(Driven):
     def noise(self, values: Array) -> Array:
         """Return the covariance [4, 4]."""
         s = self.settings
-        along, left, turn = np.diag(self._told_noise(values))
+        along, left, turn = np.diag(self._noise_at(values))
         sideways = left if len(values) == 3 else s.sideways_m_s**2
         return np.diag([along, sideways, s.upward_m_s**2, turn + s.gyro_rad_s**2])
 
     def draw(self, body: BodyState, own: Array, rng: np.random.Generator) -> Array:
         """Return the velocities of a true body."""
         vx, vy, _, wz = self.base_motion(body, own) / own[[0, 0, 0, 1]]
-        told = noisy(np.array([vx, vy, wz]), self._told_noise(np.array([vx, vy, wz])), rng)
-        return told if len(self.columns) == 3 else told[[0, 2]]
+        values = noisy(np.array([vx, vy, wz]), self._noise_at(np.array([vx, vy, wz])), rng)
+        return values if len(self.columns) == 3 else values[[0, 2]]
 
     def _all(self, values: Array) -> tuple[float, float, float]:
         return float(values[0]), float(values[1]) if len(values) == 3 else 0.0, float(values[-1])
 
-    def _told_noise(self, values: Array) -> Array:
+    def _noise_at(self, values: Array) -> Array:
         """Return the covariance [3, 3] of forward, left and rate."""
         s = self.settings
         vx, vy, wz = self._all(values)

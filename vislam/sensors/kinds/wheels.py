@@ -37,7 +37,7 @@ class WheelsSettings:
 
 
 class Wheels(Driven):
-    """Left and right speed at nominal radii: `true = scale * told` of each wheel."""
+    """Left and right speed at nominal radii: `true = scale * measured` of each wheel."""
 
     Settings = WheelsSettings
     columns = ("left_m_s", "right_m_s")
