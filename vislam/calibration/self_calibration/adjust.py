@@ -146,7 +146,7 @@ def adjust(
     iterations: int,
     damping: float = 1e-3,
 ) -> tuple[list[Piece], Shared, float]:
-    """Return pieces, shared unknowns and cost after `steps` steps at most; only `free` [SHARED] ones move."""
+    """Return pieces, shared unknowns and cost after `iterations` steps at most; only `free` [SHARED] ones move."""
     pieces = list(pieces)
     cost = _cost(pieces, shared, prior, sigma_px)
     for _ in range(iterations):
