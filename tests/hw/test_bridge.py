@@ -145,7 +145,7 @@ def test_an_mpu_in_the_place_of_a_gy85_is_never_read_in_its_units(config: Serial
 def test_a_chip_that_the_sketch_does_not_know_is_named(config: SerialConfig) -> None:
     with (
         BridgeEmulator(Path(config.port), at_rest, board="stranger"),
-        pytest.raises(HardwareError, match=r"a chip that says 0x98, and the sketch knows MPU-6050 0x68"),
+        pytest.raises(HardwareError, match=r"a chip with the id 0x98, and the sketch knows MPU-6050 0x68"),
     ):
         SerialBridge(replace(config, start_s=3.0))
 

@@ -280,7 +280,7 @@ def test_what_is_in_the_place_of_a_chip_is_told() -> None:
     with fifo_board("LSM6DSOX") as (driver, virtual, clock):
         driver.close()
         inertial_chip(virtual).registers[0x0F] = 0x69
-        with pytest.raises(HardwareError, match=r"0x6a says 0x69 in register 0x0f.*vislam doctor") as refused:
+        with pytest.raises(HardwareError, match=r"0x6a has 0x69 in register 0x0f.*vislam doctor") as refused:
             FifoBoard(BoardConfig(bus=virtual.path), clock)
         assert refused.value.exit_code == 5
         virtual.chips.clear()

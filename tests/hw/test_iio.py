@@ -218,10 +218,10 @@ def test_what_cannot_be_used_says_so(tmp_path: Path) -> None:
     with pytest.raises(HardwareError, match="no device icm streams"):
         find_devices(tmp_path, "icm")
     (both.folder / "in_accel_scale").unlink()
-    with pytest.raises(HardwareError, match=r"tells no scale of accel.*udev rule"):
+    with pytest.raises(HardwareError, match=r"has no scale of accel.*udev rule"):
         IioImu(config(), root=tmp_path)
     (both.folder / "in_accel_scale").write_text("nan")
-    with pytest.raises(HardwareError, match="tells no scale"):
+    with pytest.raises(HardwareError, match="has no scale"):
         IioImu(config(), root=tmp_path)
     (both.folder / "in_accel_scale").write_text("0.001")
     (both.folder / "current_timestamp_clock").unlink()

@@ -54,7 +54,7 @@ def test_images_are_stamped_in_the_middle_of_the_exposure(world: World) -> None:
         assert shot.image[0, 0].tolist() == [200, 0, 0]
         world.metadata = {}
         assert stream.next() is not None
-        assert "exposure is not told" in stream.stamped_by
+        assert "exposure is unknown" in stream.stamped_by
 
 
 def test_a_clock_that_counts_sleep_is_known_by_the_age_of_its_stamps(

@@ -11,7 +11,7 @@ class AccelAtGyro:
     """Keeps samples of a gyro and an accelerometer until the latter can be interpolated to the former's stamps."""
 
     def __init__(self, keep: int) -> None:
-        """Keep at most so many samples of one that wait for the other."""
+        """Keep at most `keep` samples of one that wait for the other."""
         self._gyro: deque[tuple[int, Array]] = deque(maxlen=keep)
         self._accel: deque[tuple[int, Array]] = deque(maxlen=keep)
         self._last_ns = 0

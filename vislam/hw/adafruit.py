@@ -29,7 +29,7 @@ _BNO_REPORTS = {"acceleration": 0x01, "gyro": 0x02, "magnetic": 0x03}  # calibra
 class AdafruitImu:
     """Satisfies `InertialSource` with a driver object's `acceleration` (m/s^2), `gyro` (rad/s) and `magnetic` (uT).
 
-    Stamps are the host's, in the middle between asking for the first value and having the second: such drivers tell
+    Stamps are the host's, in the middle between asking for the first value and having the second: such drivers give
     no time, and so the stamps jitter as the machine does. Values that are the last ones again are no new sample: chips
     that report by themselves (BNO085) may be asked more often than they report. One thread only.
     """
@@ -87,7 +87,7 @@ class AdafruitImu:
 
     @property
     def temperature_c(self) -> float | None:
-        """Temperature that the driver tells; None where it does not."""
+        """Temperature by the driver; None where it has none."""
         return self._map.temperature_c
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:

@@ -113,10 +113,10 @@ def check_stamps(source: object, where: str) -> list[Finding]:
     findings = [Finding("ok", f"stamped by {stamped_by}{bound}", where, "")]
     if isinstance(source, FifoBoard):
         what = "this driver was tested against an emulator written from the data sheet and has not met a real chip"
-        findings.append(Finding("ok", what, where, "tell us what you see: docs/sensors.md"))
+        findings.append(Finding("ok", what, where, "report what you see: docs/sensors.md"))
     if isinstance(source, OwnImu):
         what = "this driver was tested against a stand-in for its library and has not met a real device"
-        findings.append(Finding("ok", what, where, "tell us what you see: docs/sensors.md"))
+        findings.append(Finding("ok", what, where, "report what you see: docs/sensors.md"))
     return findings
 
 

@@ -1,4 +1,4 @@
-"""The magnetometer of a board: found, asked at its rate, judged, and told as samples of the body's axes."""
+"""The magnetometer of a board: found, polled at its rate, judged, and turned into samples of the body's axes."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ class BodyMap:
 
     Attributes:
         zero: the temperature at which biases were taken.
-        temperature_c: smoothed; None where the source does not tell.
+        temperature_c: smoothed; None where the source has none.
     """
 
     def __init__(self, config: BoardConfig) -> None:

@@ -255,7 +255,7 @@ def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: C
 
 
 def _look_at_imu(notes: _Notes, source: InertialSource, name: str, seconds: float, clock: Clock) -> None:
-    """Measure what an IMU gives, and note what it says of itself."""
+    """Measure what an IMU gives, and note what it reports of itself."""
     inertial, magnetic = _listen(source, seconds, clock)
     if isinstance(source, SerialBridge):
         notes.devices.append(Device("chips", name, source.board_name))
@@ -382,7 +382,7 @@ def _examine_cameras(
 
 
 def _look_at_camera(notes: _Notes, camera: _AnyCamera, seconds: float, clock: Clock) -> None:
-    """Measure what a camera gives, and note what it says of itself."""
+    """Measure what a camera gives, and note what it reports of itself."""
     images = list(_captured(camera, seconds, clock))
     _note_timing(notes, f"{camera.path}: images", images, camera.rate_hz, "error")
     for setting in camera.settings:
@@ -397,7 +397,7 @@ def _look_at_camera(notes: _Notes, camera: _AnyCamera, seconds: float, clock: Cl
         notes.add("ok", f"stamped by {camera.stamped_by}", camera.path)
     if isinstance(camera, LibraryCamera):
         what = "this driver was tested against a stand-in for its library and has not met a real camera"
-        notes.add("ok", what, camera.path, "tell us what you see: docs/sensors.md")
+        notes.add("ok", what, camera.path, "report what you see: docs/sensors.md")
 
 
 def _opened(wanted: str, open_capture: Callable[[str], Capture] | None, sensors: SensorsConfig) -> _AnyCamera:

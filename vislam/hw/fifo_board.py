@@ -24,7 +24,7 @@ _ASKED_PER_SAMPLE = 1.07  # no whole number: questions then sweep over the sampl
 
 
 class FifoBoard:
-    """Satisfies `InertialSource`. The chip paces gyro and accelerometer; its FIFO says how many samples are new.
+    """Satisfies `InertialSource`. The chip paces gyro and accelerometer; its FIFO has how many samples are new.
 
     Stamps are those of the chip's clock as the counts place it in the host's, less the delay of the gyro's filter; the
     accelerometer is interpolated to them. A host that comes late loses nothing until the FIFO is full. One thread
@@ -81,7 +81,7 @@ class FifoBoard:
         return self._samples.stamps.bound_ms
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT is set when it is far."""
         self._samples.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
@@ -110,7 +110,7 @@ class FifoBoard:
     def _poll(self) -> list[ImuSample | MagSample]:
         now = self._clock.now_ns()
         if self._imu_link.is_up:
-            self._imu_link.newest_ns += max(now - self._next_ns, 0)  # while nobody asked, the chip was not silent
+            self._imu_link.newest_ns += max(now - self._next_ns, 0)  # between calls the chip was not silent
         if not self._links.are_up:
             self._links.connect(now)
         samples: list[ImuSample | MagSample] = []

@@ -83,7 +83,7 @@ class FifoSamples:
         self._accel_before = None
 
     def take_temperature(self, found_c: float) -> None:
-        """Take what the chip says, about twice a second."""
+        """Take what the chip reports, about twice a second."""
         self.temperature_c = found_c if self.temperature_c is None else 0.5 * (self.temperature_c + found_c)
 
     def made(self, raw: RawSamples, asked_ns: int, answered_ns: int, tallies: Counter[str]) -> Made:

@@ -109,6 +109,6 @@ class UbxStream:
         return found
 
     def end_burst(self) -> list[Fix]:
-        """Return nothing: messages tell their length; see `FixStream`."""
+        """Return nothing: messages have their length; see `FixStream`."""
         self._burst_ns = None
         return []

@@ -100,7 +100,7 @@ class Gy85:
         return self._mag.name
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT is set when it is far."""
         self._zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
 
     def run_self_tests(self) -> tuple[SelfTest, ...]:

@@ -6,7 +6,7 @@ from enum import IntFlag
 
 
 class Health(IntFlag):
-    """32 bits. The low half says how the estimate is, the high half what ails the sensors; 0 is not yet started."""
+    """32 bits. The low half is the state of the estimate, the high half faults of the sensors; 0 is not yet started."""
 
     LEVELLED = 1 << 0  # gravity is known
     VISION_OK = 1 << 1  # vision corrects the filter

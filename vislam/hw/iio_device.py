@@ -70,9 +70,9 @@ class IioDevice:
     """A device that is set up and gives scans of the kinds it has; owns its file, and switches it off when closed.
 
     Attributes:
-        name: of the chip, as the kernel's driver says.
+        name: of the chip, by the kernel's driver.
         kinds: `anglvel`, `accel` or both.
-        rate_hz: that was set, or that there is; None: the driver does not tell.
+        rate_hz: that was set, or that there is; None: the driver does not have it.
         clock: of its stamps, `monotonic` or `realtime`.
     """
 
@@ -116,7 +116,7 @@ class IioDevice:
     def _received(self) -> bytes:
         try:
             got = os.read(self._fd, _READ_BYTES)
-        except BlockingIOError:  # somebody else was faster
+        except BlockingIOError:  # another reader was faster
             return b""
         if not got:
             raise OSError(f"{self._node} ended")
@@ -196,7 +196,7 @@ class IioDevice:
             found = [_text(self._folder / f"{stem}_offset") for stem in stems]
             offsets.append(float(next((text for text in found if text), "0")))
         if not np.isfinite(scales).all() or not np.isfinite(offsets).all() or 0.0 in scales:
-            raise ValueError(f"it tells no scale of {kind}")
+            raise ValueError(f"it has no scale of {kind}")
         return np.array(scales), np.array(offsets)
 
     def _write(self, name: str, value: str) -> None:

@@ -27,7 +27,7 @@ _FAR_NS = 2 * _NS  # a stamp so far from now is of another clock
 class IioImu:
     """Satisfies `InertialSource` with one device of gyro and accelerometer, or with one of each.
 
-    Stamps are the kernel's, taken at the chip's interrupt; `config.delay_s` is taken off (the kernel does not tell the
+    Stamps are the kernel's, taken at the chip's interrupt; `config.delay_s` is taken off (the kernel does not have the
     delay of a filter: None is none). Where gyro and accelerometer are devices of their own, the accelerometer is
     interpolated to the gyro's stamps. One thread only.
     """

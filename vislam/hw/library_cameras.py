@@ -128,7 +128,7 @@ def factory_rig(name: str, config: SensorsConfig, with_imu: bool = False) -> tup
 
 
 def frame_config(name: str, config: SensorsConfig) -> DepthCameraConfig:
-    """Return the settings of a camera that gives frames, with what its name says."""
+    """Return the settings of a camera that gives frames, with what its name sets."""
     return _oak(name, config) if _kind(name) == "oak" else _realsense(name, config)
 
 

@@ -17,7 +17,7 @@ START_ATTEMPTS = 3  # a wire may be disturbed just then
 
 @dataclass(slots=True, eq=False)
 class Link:
-    """How it stands with one chip: `start` finds it and sets it up, `fault` says in the health word that it is bad."""
+    """How it stands with one chip: `start` finds it and sets it up, `fault` is its bit in the health word."""
 
     start: Callable[[I2cBus], None]
     fault: Health
@@ -55,7 +55,7 @@ class ChipLinks:
 
     Attributes:
         counts: how often each fault occurred since the start.
-        events: health bits of what happened since `health` last told them.
+        events: health bits of what happened since `health` last reported them.
     """
 
     def __init__(self, config: Gy85Config | BoardConfig, clock: Clock, links: tuple[Link, ...]) -> None:

@@ -1,4 +1,4 @@
-"""The IMU inside a camera: threads of the device put samples in, whoever reads inertial samples takes them."""
+"""The IMU inside a camera: threads of the device put samples in, the reader of inertial samples takes them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class OwnImu:
 
     Attributes:
         stamped_by: where the stamps come from, for a person.
-        problem: why no samples come, empty when they do or nobody knows.
+        problem: why no samples come, empty when they do or it is unknown.
     """
 
     def __init__(self, name: str, config: DepthCameraConfig) -> None:
@@ -88,7 +88,7 @@ class OwnImu:
             self._merge()
 
     def count(self, what: str, event: Health | None = None) -> None:
-        """Count a fault, with the bit that tells of it."""
+        """Count a fault, with the bit that reports it."""
         with self._has_come:
             self._counts[what] += 1
             self._events |= Health(0) if event is None else event

@@ -26,8 +26,8 @@ _NS = 1_000_000_000
 _READ_BYTES = 4096
 _GAP_S = 0.05  # without a byte for so long, a burst is over
 _REOPEN_S = 0.5  # between attempts to open a port that is not there
-_SILENT_NS = 5 * _NS  # without a byte for so long, the port is opened anew
-_MOST_WAITING = 256  # readings that nobody took
+_SILENT_NS = 5 * _NS  # without a byte for this long, the port is opened again
+_MOST_WAITING = 256  # readings that were not taken
 _CLOSING_S = 2.0
 
 
@@ -42,7 +42,7 @@ def check_port(config: SensorPort) -> None:
 class ReadingPort:
     """Reads a sensor until it is closed; a port that goes away is looked for again. Nothing is written to it.
 
-    Readings are stamped by CLOCK_MONOTONIC, less the delay of the settings; `Talk` says how.
+    Readings are stamped by CLOCK_MONOTONIC, less the delay of the settings; see `Talk`.
     """
 
     def __init__(self, name: str, config: SensorPort) -> None:
@@ -70,7 +70,7 @@ class ReadingPort:
         return found
 
     def status(self) -> str:
-        """Return "well", or what ails port or device."""
+        """Return "well", or the problem of port or device."""
         return self._problem or self._talk.status()
 
     def counters(self) -> dict[str, int]:
@@ -79,7 +79,7 @@ class ReadingPort:
 
     @property
     def datum(self) -> Geodetic | None:
-        """Where the frame of the readings begins: as told, or the first good fix; None before that, or without one."""
+        """Where the frame of the readings begins: as given, or the first good fix; None before that, or without one."""
         return self._talk.datum
 
     def close(self) -> None:

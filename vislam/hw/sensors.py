@@ -39,12 +39,12 @@ INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial", *WITH_I
 def open_inertial(
     name: str, config: SensorsConfig, must_be_there: bool = True, further: socket.socket | None = None
 ) -> InertialSource:
-    """Open what a name says; the rest is in the settings.
+    """Open what a name gives; the rest is in the settings.
 
     `gy85[:BUS]`, `board[:BUS]` or a chip in its place, `bno085`, `adafruit:MODULE.CLASS`, `iio[:NAME]` for a chip that
     the kernel drives, `serial[:PORT]`.
 
-    What a serial bridge says of further sensors goes to `further`.
+    What a serial bridge sends of further sensors goes to `further`.
 
     Raises:
         UsageError: there is no such kind of sensor.
@@ -73,7 +73,7 @@ def open_inertial(
 
         bridge = replace(config.serial, port=where) if where else config.serial
         return SerialBridge(bridge, must_be_there, further)
-    reads_own_imu(name, "none")  # says that its camera has to be opened with it
+    reads_own_imu(name, "none")  # raises: its camera has to be opened with it
     raise UsageError(
         f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, with a place such as gy85:/dev/i2c-1, "
         "serial:/dev/ttyUSB0, iio:lsm6dsox, adafruit:adafruit_lsm6ds.lsm6dsox.LSM6DSOX"
@@ -81,7 +81,7 @@ def open_inertial(
 
 
 def _board(kind: str, where: str, config: SensorsConfig) -> BoardConfig:
-    """Return the settings of a board with what its name says."""
+    """Return the settings of a board with what its name sets."""
     board = replace(config.board, bus=where) if where else config.board
     family = CHIPS[kind]
     return board if family is None else replace(board, chip=family)

@@ -16,11 +16,11 @@ class InertialSource(Protocol):
 
     @property
     def temperature_c(self) -> float | None:
-        """Temperature of the gyro; None where it does not tell."""
+        """Temperature of the gyro; None where it has none."""
         ...
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Tell at which temperature biases were taken, and by how much [3] the gyro's change per deg C (rad/s).
+        """Set at which temperature biases were taken, and by how much [3] the gyro's change per deg C (rad/s).
 
         From then on samples come without that drift, so that an estimator's bias stays what it was there.
         """
@@ -29,7 +29,7 @@ class InertialSource(Protocol):
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured since the last call, in time order (CLOCK_MONOTONIC ns).
 
-        Waits at most `timeout_s` for the first one; an empty list means that none came, and `health` says why. A sensor
+        Waits at most `timeout_s` for the first one; an empty list: none came, and `health` has the reason. A sensor
         that went away is looked for again in later calls. Never raises for what a plug or a cable can cause.
         """
         ...
@@ -51,8 +51,8 @@ class InertialSource(Protocol):
 class CapturedImage:
     """The newest image of a camera."""
 
-    t_ns: int  # of capture, CLOCK_MONOTONIC: middle of the exposure where the device tells, else the driver's stamp
-    index: int  # counts captured images, so that a hole tells how many were dropped
+    t_ns: int  # of capture, CLOCK_MONOTONIC: middle of the exposure where the device knows it, else the driver's stamp
+    index: int  # counts captured images, so that a hole shows how many were dropped
     image: ImageU8  # [H, W] or [H, W, 3] BGR
 
 

@@ -29,12 +29,12 @@ _MICROSECONDS = 2**32
 
 
 class Talk(Protocol):
-    """Makes readings of what one device says."""
+    """Makes readings of what one device sends."""
 
     datum: Geodetic | None  # where the frame of the readings begins; None: none, or not known yet
 
     def begin(self) -> None:
-        """Forget what was half said: the device was plugged in anew."""
+        """Forget what was half said: the device was plugged in again."""
         ...
 
     def feed(self, data: bytes, arrival_ns: int) -> list[Reading]:
@@ -97,7 +97,7 @@ class FixTalk:
 
     @property
     def datum(self) -> Geodetic | None:
-        """As told, or the first good fix; None before that."""
+        """As given, or the first good fix; None before that."""
         frame = self._readings.frame
         return None if frame is None else frame.datum
 
@@ -146,7 +146,7 @@ class CountTalk:
         self._speeds = TickSpeeds(settings)
 
     def begin(self) -> None:
-        """Forget the last counts: they may have begun anew."""
+        """Forget the last counts: they may have begun again."""
         self._speeds = TickSpeeds(self._settings)
 
     def counted(self, t_ns: int, left: int, right: int) -> list[Reading]:
@@ -173,7 +173,7 @@ class CountTalk:
 class LineTalk:
     """Satisfies `Talk`: lines of numbers, in the order of the columns of the sensor's kind or `left right` counts.
 
-    A word before them says nothing. A number more than are asked is the device's clock in microseconds, 32 bits;
+    A word before them is ignored. A number more than are asked is the device's clock in microseconds, 32 bits;
     without it a line has the time of its first byte. What begins with # is a remark.
     """
 
@@ -240,7 +240,7 @@ class LineTalk:
             fields.popleft()
         try:
             numbers = [float(field) for field in fields]
-            told = numbers[self._columns :]
+            further = numbers[self._columns :]
             if not all(map(math.isfinite, numbers)) or len(numbers) not in (self._columns, self._columns + 1):
                 raise ValueError
             if self._count is not None and not all(number.is_integer() for number in numbers):
@@ -248,7 +248,7 @@ class LineTalk:
         except ValueError:
             self._faults["damaged"] += 1
             return []
-        stamp_ns = self._clock.stamp(int(told[0]) % _MICROSECONDS, self._line_ns) if told else self._line_ns
+        stamp_ns = self._clock.stamp(int(further[0]) % _MICROSECONDS, self._line_ns) if further else self._line_ns
         if stamp_ns is None:
             self._faults["unstamped"] += 1
             return []

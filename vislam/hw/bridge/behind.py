@@ -22,9 +22,9 @@ _MOST_APART = 1.5  # periods between samples that follow each other
 
 
 class Behind:
-    """Turns counts into samples, by what the device says about its chips.
+    """Turns counts into samples, by what the device states about its chips.
 
-    A GY-85's filters are known from the settings. Any other chip tells its own in a frame of `Ages`; before it has,
+    A GY-85's filters are known from the settings. Any other chip states its own in a frame of `Ages`; before it has,
     nothing is made of its counts.
     """
 
@@ -47,11 +47,11 @@ class Behind:
         self._accel_before = None
 
     def take_ages(self, ages: Ages) -> None:
-        """Take what the device says of the hello that follows."""
+        """Take the ages that belong to the hello that follows."""
         self._ages = ages
 
     def greet(self, hello: Hello) -> None:
-        """Take what the device says about its chips."""
+        """Take what the device states about its chips."""
         before, c = self.hello, self._config.calibration
         self.hello = hello
         if before is None or _scales(before) != _scales(hello):
@@ -72,7 +72,7 @@ class Behind:
 
     @property
     def name(self) -> str:
-        """What the device says it has, in words; empty before it did."""
+        """What the device states to have, in words; empty before it did."""
         hello = self.hello
         if hello is None:
             return ""
@@ -103,21 +103,21 @@ class Behind:
         return f"the board runs and {what}; check the chips' power, SDA and SCL"
 
     def _stranger(self) -> str:
-        """Return what the device says of a chip that its sketch does not know; empty: there is none."""
+        """Return a chip's id by the device that its sketch does not know; empty: there is none."""
         hello = self.hello
         if hello is None or hello.chips & (Chips.ACCEL | Chips.GYRO):
             return ""
         if hello.accel_id in (0, _ADXL345) or hello.accel_id in mpu6050.IDS:
             return ""
         known = ", ".join(f"{name} 0x{value:02x}" for value, name in mpu6050.IDS.items())
-        return f"a chip that says 0x{hello.accel_id:02x}, and the sketch knows {known}"
+        return f"a chip with the id 0x{hello.accel_id:02x}, and the sketch knows {known}"
 
     def field(self, raw: RawSample, stamp_ns: int) -> MagSample:
         """Return the sample of the magnetometer whose frame was stamped so; call it where all is known."""
         assert self._maps is not None
         mag_map = self._maps[2]
-        told = self._told
-        delay_ns = self._gy85_mag_ns if told is None else self.line_ns + 1000 * told.mag_us
+        ages = self._stated
+        delay_ns = self._gy85_mag_ns if ages is None else self.line_ns + 1000 * ages.mag_us
         field_ut = mag_map.matrix @ np.array(raw.mag, dtype=np.float64) + mag_map.offset
         return MagSample(stamp_ns - delay_ns, field_ut)
 
@@ -125,17 +125,17 @@ class Behind:
         """Return the inertial sample of a frame that was stamped so, at the time of what the gyro's filter shows."""
         assert self._maps is not None
         gyro_map, accel_map, _ = self._maps
-        told = self._told
-        delay_ns = self._gy85_ns if told is None else self.line_ns + 1000 * told.gyro_us
+        ages = self._stated
+        delay_ns = self._gy85_ns if ages is None else self.line_ns + 1000 * ages.gyro_us
         rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
         rate -= drift_rad_s
         accel = np.array(raw.accel, dtype=np.float64)
-        if told is not None:
-            accel = self._at_gyro(raw.t_us, accel, told)
+        if ages is not None:
+            accel = self._at_gyro(raw.t_us, accel, ages)
         return ImuSample(stamp_ns - delay_ns, rate, accel_map.matrix @ accel + accel_map.offset)
 
     @property
-    def _told(self) -> Ages | None:
+    def _stated(self) -> Ages | None:
         return self._ages if self.hello is not None and _is_one_chip(self.hello) else None
 
     def _at_gyro(self, t_us: int, accel: Array, ages: Ages) -> Array:

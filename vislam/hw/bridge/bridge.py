@@ -42,18 +42,18 @@ _NS = 1_000_000_000
 # pyserial raises all of them at a device that goes away; its own SerialException is an OSError
 PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
 _READ_BYTES = 4096
-_GLANCE_S = 0.05  # while the first sample is waited for, a port that cannot be opened is told so soon
-_NOMINAL_HZ = 400.0  # until the device says it
+_GLANCE_S = 0.05  # while the first sample is waited for, so soon a port that cannot be opened is reported
+_NOMINAL_HZ = 400.0  # until the device states it
 _SEQUENCES = 2**16
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
 
 
 class SerialBridge:
-    """Satisfies `InertialSource`. Frames come from firmware/vislam_bridge; `bridge_protocol` says what is in them.
+    """Satisfies `InertialSource`. Frames come from firmware/vislam_bridge; see `protocol`.
 
-    What a plug, a cable or a wrong port can cause is told by `health`, `counters` and, in words, `problem`. A port that
-    goes away is looked for every `config.reopen_s`; one that gives no sample for `config.start_s` is opened anew, which
-    starts an Arduino anew. Nothing is ever written to it. One thread only.
+    What a plug, a cable or a wrong port can cause is in `health`, `counters` and, in words, `problem`. A port that
+    goes away is looked for every `config.reopen_s`; one that gives no sample for `config.start_s` is opened again,
+    which restarts an Arduino. Nothing is ever written to it. One thread only.
     """
 
     stamped_by = "the board's clock, on the line below the arrivals of its frames"
@@ -61,7 +61,7 @@ class SerialBridge:
     def __init__(self, config: SerialConfig, must_be_there: bool = True, further: socket.socket | None = None) -> None:
         """Open the port and wait for the first sample, `config.start_s` and a second at most.
 
-        With `must_be_there` False nothing is waited for and nothing that is missing is an error. What the board says
+        With `must_be_there` False nothing is waited for and nothing that is missing is an error. What the board sends
         of encoders and a satellite receiver goes to `further`, see `Passer`.
 
         Raises:
@@ -82,8 +82,8 @@ class SerialBridge:
         self._sequence: int | None = None
         self._counts: Counter[str] = Counter()
         self._events = Health(0)
-        self._steps_told = 0
-        self._faults = Health(0)  # that the last frames tell
+        self._steps_reported = 0
+        self._faults = Health(0)  # that the last frames report
         self._newest_ns = 0  # when the last inertial sample came
         self._accel_watch, self._gyro_watch = _Watch(), _Watch()
         self._temperature_c: float | None = None
@@ -98,7 +98,7 @@ class SerialBridge:
         return self._temperature_c
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT tells when it is far."""
+        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT is set when it is far."""
         self._zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
 
     @property
@@ -140,8 +140,8 @@ class SerialBridge:
     def health(self) -> Health:
         """Return the sensor bits that hold now and the events since the last call."""
         word, self._events = self._events | self._faults, Health(0)
-        if self._clock.steps > self._steps_told:
-            self._steps_told = self._clock.steps
+        if self._clock.steps > self._steps_reported:
+            self._steps_reported = self._clock.steps
             word |= Health.CLOCK_STEP
         if time.monotonic_ns() - self._newest_ns > self._config.missing_s * _NS:
             word |= Health.IMU_MISSING
@@ -273,7 +273,7 @@ class SerialBridge:
         return self._sampled(message, hello, arrival_ns)
 
     def _greet(self, hello: Hello) -> None:
-        """Take what the device says about itself."""
+        """Take what the device states about itself."""
         if Chips.STARTED in hello.chips and self._behind.hello is not None:
             self._counts["device_restarts"] += 1
             self._clock.restart()
@@ -309,7 +309,7 @@ class SerialBridge:
         return samples
 
     def _note_status(self, raw: RawSample, hello: Hello) -> None:
-        """Count what a sample says about itself, and what its counts say."""
+        """Count the faults that a sample reports, and those of its counts."""
         faults, counts, stuck = Health(0), self._counts, round(self._config.stuck_s * hello.rate_hz)
         if Status.MISSED in raw.status:
             counts["device_late"] += 1

@@ -41,7 +41,7 @@ class DeviceClock:
         self._begin()
 
     def restart(self) -> None:
-        """Begin a new line: the device was started or plugged in anew."""
+        """Begin a new line: the device was restarted or plugged in again."""
         if self._last is not None:
             self.steps += 1
         self._begin()
@@ -105,7 +105,7 @@ class DeviceClock:
         self._last = point
 
     def _fit(self, now_ns: int) -> None:
-        """Lay the line anew under the least delayed arrivals of the window."""
+        """Lay the line again under the least delayed arrivals of the window."""
         config, points = self._config, self._lowest
         while points and points[0].device_ns < now_ns - config.window_s * 1e9:
             points.popleft()
@@ -119,7 +119,7 @@ class DeviceClock:
         self._anchor = min(points, key=self._delay_ns)
 
     def _forget_before_step(self, now_ns: int) -> None:
-        """Begin anew where everything has been late for long: the device's clock lost time.
+        """Begin again where everything has been late for long: the device's clock lost time.
 
         What was only read late, in one burst after the host was busy, arrived within no time and is no such case.
         """

@@ -53,7 +53,7 @@ class PassedReadings:
         return found
 
     def status(self) -> dict[str, str]:
-        """Return by sensor "well", or what ails the bridge, its sketch or the device at it."""
+        """Return by sensor "well", or the problem of the bridge, its sketch or the device at it."""
         asked = dict.fromkeys(self._counts, Chips.ENCODERS) | dict.fromkeys(self._fixes, Chips.GNSS)
         talks: dict[str, CountTalk | FixTalk] = {**self._counts, **self._fixes}
         return {
@@ -67,7 +67,7 @@ class PassedReadings:
         return {name: talk.counters() for name, talk in talks.items()}
 
     def datums(self) -> dict[str, Geodetic]:
-        """Return by receiver where its frame begins, as far as it has told."""
+        """Return by receiver where its frame begins, as far as it has reported."""
         return {name: datum for name, talk in self._fixes.items() if (datum := talk.datum) is not None}
 
     def close(self) -> None:

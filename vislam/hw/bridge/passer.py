@@ -1,4 +1,4 @@
-"""What the serial bridge says besides inertial data, handed on to whoever reads the further sensors of a run.
+"""What the serial bridge sends besides inertial data, handed on to the reader of a run's further sensors.
 
 The process that reads the bridge publishes the pose and never waits: what the other one does not take in time is lost,
 and counted.
@@ -47,7 +47,7 @@ class BridgeState:
     problem: str  # empty: it is there
 
 
-News = CountsAt | BytesAt | BridgeState
+PassedOn = CountsAt | BytesAt | BridgeState
 
 
 class Passer:
@@ -58,7 +58,7 @@ class Passer:
         self.counts: Counter[str] = Counter()
         self._clock, self._delay_ns, self._to = clock, delay_ns, to
         self._sequences: dict[type, int] = {}
-        self._told: tuple[Chips, str, int] | None = None
+        self._reported: tuple[Chips, str, int] | None = None
         if to is not None:
             to.setblocking(False)
 
@@ -69,49 +69,49 @@ class Passer:
         self._sequences[type(message)] = message.sequence
         self.counts[f"{name}_frames"] += 1
         lost = 0 if last is None else (message.sequence - last - 1) % _SEQUENCES
-        self.counts[f"{name}_lost"] += lost if lost < _SEQUENCES // 2 else 0  # else it began anew, and nobody said so
+        self.counts[f"{name}_lost"] += lost if lost < _SEQUENCES // 2 else 0  # else it began again, unannounced
         line_ns = self._clock.host_ns(message.t_us)
-        if line_ns is None or self._told is None:
+        if line_ns is None or self._reported is None:
             self.counts[f"{name}_unstamped"] += 1
             return
-        if self._told[2] != self._clock.steps:  # stamps before and after have no interval
-            self._tell(self._told[0], self._told[1])
+        if self._reported[2] != self._clock.steps:  # stamps before and after have no interval
+            self._report(self._reported[0], self._reported[1])
         if isinstance(message, Counts):
             self._send(_COUNTED, line_ns - self._delay_ns, _COUNTS.pack(message.left, message.right))
         else:
             self._send(_SAID, line_ns - self._delay_ns, message.data)
 
     def greet(self, hello: Hello) -> None:
-        """Tell what the device has, where it is new or has just started."""
+        """Report what the device has, where it is new or has just started."""
         chips = hello.chips & (Chips.ENCODERS | Chips.GNSS)
         if Chips.STARTED in hello.chips:
             self._sequences.clear()
-        if Chips.STARTED in hello.chips or self._told is None or self._told[:2] != (chips, ""):
-            self._tell(chips, "")
+        if Chips.STARTED in hello.chips or self._reported is None or self._reported[:2] != (chips, ""):
+            self._report(chips, "")
 
     def lose(self, problem: str) -> None:
-        """Tell that the bridge does not answer, and why."""
+        """Report that the bridge does not answer, and why."""
         self._sequences.clear()
-        if self._told is None or self._told[1] != problem:
-            self._tell(Chips(0), problem)
+        if self._reported is None or self._reported[1] != problem:
+            self._report(Chips(0), problem)
 
-    def _tell(self, chips: Chips, problem: str) -> None:
-        is_told = self._send(_STANDS, int(chips), problem.encode()[:_MOST_BYTES])
-        self._told = (chips, problem, self._clock.steps) if is_told else None  # else the next hello tells it
+    def _report(self, chips: Chips, problem: str) -> None:
+        is_sent = self._send(_STANDS, int(chips), problem.encode()[:_MOST_BYTES])
+        self._reported = (chips, problem, self._clock.steps) if is_sent else None  # else the next hello reports it
 
     def _send(self, kind: int, t_ns: int, data: bytes) -> bool:
-        """Return whether it went, or nobody asks for it."""
+        """Return whether it went, or is not asked for."""
         if self._to is None:
             return True
         try:
             self._to.send(_HEAD.pack(kind, t_ns) + data)
-        except OSError:  # it is full, or nobody listens any more
+        except OSError:  # it is full, or has no listener any more
             self.counts["passed_on_lost"] += 1
             return False
         return True
 
 
-def passed_on(source: socket.socket) -> Iterator[News]:
+def passed_on(source: socket.socket) -> Iterator[PassedOn]:
     """Yield what has come through the other end of a passer's socket, without waiting."""
     while True:
         try:

@@ -1,11 +1,10 @@
-"""What the serial bridge says: frames of a microcontroller that reads the chips, and a decoder that trusts nothing.
+"""What the serial bridge sends: frames of a microcontroller that reads the chips, and a decoder that trusts nothing.
 
 A frame is `type, sequence, device time, body, CRC-16`, stuffed by COBS (Cheshire and Baker, 1999) and ended by a zero
 byte, all little-endian. Samples and hellos share one sequence; counts and passed bytes, which a sketch sends only where
-it is told of encoders or a receiver, and ages, which it sends only of chips other than a GY-85's, have one each: a host
-which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`).
-The structs, flags and values below are the whole table;
-firmware/vislam_bridge/vislam_bridge.ino is the other end.
+it has encoders or a receiver, and ages, which it sends only of chips other than a GY-85's, have one each: a host
+which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`). The structs, flags and values below are the whole
+table; firmware/vislam_bridge/vislam_bridge.ino is the other end.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ SAMPLE_WIRE_BYTES = _SAMPLE.size + _CRC.size + 2  # stuffing adds one, the zero 
 
 
 class Status(IntFlag):
-    """What a sample says about itself; the remaining bits are 0."""
+    """Faults that a sample reports; the remaining bits are 0."""
 
     MAG_NEW = 1 << 0  # the magnetometer was read for this sample; otherwise its values are the last ones
     ACCEL_ERROR = 1 << 1  # the chip did not answer: its values mean nothing
@@ -48,7 +47,7 @@ class Chips(IntFlag):
     ACCEL = 1 << 0
     GYRO = 1 << 1
     MAG = 1 << 2
-    ENCODERS = 1 << 3  # the sketch was told of encoders, and counts them
+    ENCODERS = 1 << 3  # the sketch is configured for encoders, and counts them
     GNSS = 1 << 4  # ... of a satellite receiver, whose bytes it passes on
     STARTED = 1 << 7  # the first hello since the device started
 
@@ -73,7 +72,7 @@ class Hello:
     sequence: int
     t_us: int
     chips: Chips
-    # 0xE5: ADXL345; of a chip that is both, what it says in WHO_AM_I, known to the sketch if ACCEL is among `chips`
+    # 0xE5: ADXL345; of a chip that is both, what it has in WHO_AM_I, known to the sketch if ACCEL is among `chips`
     accel_id: int
     gyro_id: int  # 0x68, 0x69: ITG3200, ITG3205; of a chip that is both the same as `accel_id`
     mag_id: bytes  # 3 bytes, b"H43": HMC5883L, b"H\0\0": AK8963

@@ -74,7 +74,7 @@ def mounted_on_imu(
         cameras: of the rig.
         T_cam0_cams: poses [4, 4] of each in the first.
         has_depth: of the first.
-        config: says how far it is tilted; its position is the factory's.
+        config: by how much it is tilted; its position is the factory's.
         T_cam0_imu: [4, 4] of the factory.
     """
     T_body_cam0 = np.eye(4)

@@ -38,7 +38,7 @@ class Mailbox(Generic[Shot]):
             return image
 
     def close(self) -> None:
-        """Let nobody wait any longer."""
+        """End all waiting."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()

@@ -18,7 +18,7 @@ from vislam.hw.cameras.oak_imu import CM, OakClock, OakMotion, imu_pose, in_ns
 from vislam.hw.cameras.webcam import Setting
 from vislam.hw.own_imu import OwnImu
 
-_NEXT = timedelta(seconds=1)  # without an image for so long, the device is opened anew
+_NEXT = timedelta(seconds=1)  # without an image for this long, the device is opened again
 _MODELS = {"Perspective": "radtan", "Fisheye": "equidistant"}
 _MM = 0.001  # in which depthai states depth
 
@@ -130,7 +130,7 @@ def open_oak(
 def oak_rig(config: OakConfig, with_depth: bool = False, with_imu: bool = False) -> tuple[Rig, bool]:
     """Return the rig by the calibration in the device, which is opened for it, and whether its IMU's place is known.
 
-    It is mounted as the settings say, or with its own IMU as that lies beside its cameras, where the device tells.
+    It is mounted as the settings say, or with its own IMU as that lies beside its cameras, where the device has it.
 
     Raises:
         HardwareError: depthai or the device is missing.
@@ -152,7 +152,7 @@ def oak_rig(config: OakConfig, with_depth: bool = False, with_imu: bool = False)
         T: Array = np.eye(4) if with_depth else np.array(calibration.getCameraExtrinsics(*sockets))
     except RuntimeError as error:
         raise HardwareError(
-            f"the OAK does not tell its calibration ({error}); give --calibration.camera FILE"
+            f"the OAK does not give its calibration ({error}); give --calibration.camera FILE"
         ) from error
     finally:
         device.close()
@@ -202,7 +202,7 @@ def depthai() -> Any:
 
 
 def _check_shape(sensor: tuple[int, int], size: tuple[int, int]) -> None:
-    """Raise DataError for images of another shape than the sensor's: what is cut off then, depthai does not tell."""
+    """Raise DataError for images of another shape than the sensor's: what is cut off then, depthai does not report."""
     if sensor[0] * size[1] != sensor[1] * size[0]:
         raise DataError(
             f"the OAK's calibration is for {sensor[0]}x{sensor[1]}, which is not the shape of {size[0]}x{size[1]}; "

@@ -94,7 +94,7 @@ class OakMotion:
                 for packet in () if message is None else message.packets:
                     self._take(packet.gyroscope, self._imu.add_gyro)
                     self._take(packet.acceleroMeter, self._imu.add_accel)
-        except Exception as error:  # depthai raises what it likes; the images' thread tells and opens again
+        except Exception as error:  # depthai raises what it likes; the images' thread reports it and opens again
             if not self._is_stopping.is_set():
                 self.failure = error
 
@@ -108,7 +108,7 @@ class OakMotion:
 
 
 def imu_pose(calibration: Any, socket: Any) -> Array | None:
-    """Return the pose [4, 4] of the IMU in a camera by the factory; None where the device does not tell, as most."""
+    """Return the pose [4, 4] of the IMU in a camera by the factory; None where the device does not have it, as most."""
     T: Array | None = None
     with suppress(RuntimeError):  # there is none in its memory
         found = np.array(calibration.getCameraToImuExtrinsics(socket), dtype=np.float64)

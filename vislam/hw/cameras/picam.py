@@ -15,7 +15,7 @@ from vislam.hw.cameras.webcam import Setting
 from vislam.hw.source import CapturedImage
 
 _NS = 1_000_000_000
-_NEXT_S = 1.0  # without an image for so long, the camera is opened anew
+_NEXT_S = 1.0  # without an image for this long, the camera is opened again
 _EARLY_NS = 2_000_000  # clocks are read one after the other
 _FORMAT = "RGB888"  # libcamera's name for what lies in memory as blue, green, red
 _MANUAL_FOCUS = 0  # libcamera.controls.AfModeEnum.Manual
@@ -94,7 +94,7 @@ class PicamStream:
     def _stamp(self, metadata: dict[str, Any], arrival_ns: int, boot_ns: int) -> int:
         """Return the middle of the exposure of the first line, on CLOCK_MONOTONIC.
 
-        `SensorTimestamp` is taken as the first line begins to be read, the end of its exposure. libcamera says that its
+        `SensorTimestamp` is taken as the first line begins to be read, the end of its exposure. By libcamera its
         clock is CLOCK_BOOTTIME, kernels have stamped with CLOCK_MONOTONIC: they differ by the time that the machine
         slept, and only one of them can be right.
         """
@@ -107,7 +107,7 @@ class PicamStream:
             return arrival_ns - self._age_ns
         clock, age_ns = next(iter(possible.items()))
         exposure_ns = 1000 * int(metadata.get("ExposureTime") or 0)
-        middle = ", less half the exposure" if exposure_ns else "; the exposure is not told"
+        middle = ", less half the exposure" if exposure_ns else "; the exposure is unknown"
         self.stamped_by = f"the sensor's first line{clock}{middle}"
         self._age_ns = max(age_ns, 0) + exposure_ns // 2
         return arrival_ns - self._age_ns
@@ -138,7 +138,7 @@ def check_picam(config: PicamConfig) -> None:
     """Raise HardwareError when picamera2 or the camera is missing; nothing is started."""
     module = picamera2()
     if camera_number(config) >= len(module.Picamera2.global_camera_info()):
-        with closing(PicamStream(config)):  # says what there is
+        with closing(PicamStream(config)):  # reports what there is
             pass
 
 

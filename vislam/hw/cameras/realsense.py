@@ -20,7 +20,7 @@ from vislam.hw.cameras.realsense_imu import RealsenseMotion, ask_motion, imu_pos
 from vislam.hw.cameras.webcam import Setting
 from vislam.hw.own_imu import OwnImu
 
-_NEXT_MS = 1000  # without frames for so long, the device is opened anew
+_NEXT_MS = 1000  # without frames for this long, the device is opened again
 _WRAP_US = 2**32
 _SETTLE_NS = 3_000_000_000  # in which an IMU that is there has laid the line of the clock
 _WAITING = 2  # sets of images; the library has 16 to fill

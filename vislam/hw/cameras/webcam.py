@@ -42,7 +42,7 @@ class Capture(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What was asked of the camera and what it says it does; None: it does not offer it."""
+    """What was asked of the camera and what it reports to do; None: it does not offer it."""
 
     name: str
     asked: float | str
@@ -61,7 +61,7 @@ class Webcam:
 
     Images are stamped by the driver where its clock is CLOCK_MONOTONIC or the wall clock. Stamps of a clock of the
     camera's own, whose rate may be off, are put on the line that lies under their arrivals, less `config.delay_s`;
-    without any stamps arrivals less as much have to do. `stamped_by` says which. A camera that goes away is looked
+    without any stamps arrivals less as much have to do. `stamped_by` names which. A camera that goes away is looked
     for every `config.reopen_s`.
     """
 
@@ -74,7 +74,7 @@ class Webcam:
         """Open the camera and wait for its first image, `config.start_s` at most.
 
         With `must_be_there` False nothing is waited for and a missing camera is no error. `open_capture` opens a
-        device file; OpenCV does it unless told otherwise.
+        device file; OpenCV does it by default.
 
         Raises:
             HardwareError: there is no such camera, it may not be opened, or it gives no image.
@@ -247,7 +247,7 @@ def _camera_name(path: str) -> str:
 
 
 def _set_format(capture: Capture, config: WebcamConfig) -> None:
-    """Ask for format, size and rate, before the stream runs: each change makes the driver set up its buffers anew."""
+    """Ask for format, size and rate, before the stream runs: each change makes the driver set up its buffers again."""
     capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.width_px)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.height_px)

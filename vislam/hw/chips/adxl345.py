@@ -55,7 +55,7 @@ class Adxl345:
         found = self._bus.read(self._address, _DEVID, 1)[0]
         if found != _ID:
             raise HardwareError(
-                f"{self._bus.path}: the chip at 0x{self._address:02x} says 0x{found:02x}, an ADXL345 says 0x{_ID:02x}; "
+                f"{self._bus.path}: the chip at 0x{self._address:02x} has id 0x{found:02x}, an ADXL345 0x{_ID:02x}; "
                 "check which board this is"
             )
         for register, value in (

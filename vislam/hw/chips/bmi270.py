@@ -111,7 +111,7 @@ class Bmi270:
         return Waiting(count // FRAME_BYTES, False)
 
     def take(self, units: int) -> RawSamples:
-        """Take so many frames, each the gyro and then the accelerometer; raises BusError: then `empty` it."""
+        """Take `units` frames, each the gyro and then the accelerometer; raises BusError: then `empty` it."""
         data = popped(self._pops, units)
         if not data:
             return NO_SAMPLES

@@ -33,7 +33,7 @@ _KINDS = {
 _NEXT_STEP = {
     "nack": "check the chip's power and wires; `vislam doctor` lists what answers",
     "timeout": "a line is held low: check for a short circuit, or switch the board's power off and on",
-    "busy": "a kernel driver owns the address: unbind it; `vislam doctor` says how",
+    "busy": "a kernel driver owns the address: unbind it; `vislam doctor` shows how",
     "gone": "the adapter is not there: plug it in, or enable I2C (raspi-config); `vislam doctor` lists buses",
     "permission": "add yourself to the group that owns the device (usually: sudo usermod -aG i2c $USER), log in again",
     "other": "run `vislam doctor`",

@@ -54,7 +54,7 @@ class FifoImu(Protocol):
     Attributes:
         name: as its maker calls it.
         address: on the bus.
-        rate_hz: samples per second by the chip's nominal clock; after `configure` as well as the chip tells it.
+        rate_hz: samples per second by the chip's nominal clock; after `configure` as well as the chip knows it.
         gyro_rad_s: of a count.
         accel_m_s2: of a count.
         gyro_delay_s: by which the gyro's filter is late.
@@ -82,7 +82,7 @@ class FifoImu(Protocol):
         ...
 
     def take(self, units: int) -> RawSamples:
-        """Take so many units out of the FIFO, as `waiting` counted them; raises BusError: then `empty` it."""
+        """Take `units` units out of the FIFO, as `waiting` counted them; raises BusError: then `empty` it."""
         ...
 
     def empty(self) -> None:
@@ -100,12 +100,12 @@ def next_of(asked: float, offered: dict[int, int]) -> int:
 
 
 def refuse_other(bus: I2cBus, address: int, found: int, names: dict[int, str]) -> str:
-    """Return the name of the chip that says `found`; raises HardwareError for one that is not among `names`."""
+    """Return the name of the chip with the id `found`; raises HardwareError for one that is not among `names`."""
     if found in names:
         return names[found]
     known = ", ".join(f"{name} 0x{value:02x}" for value, name in names.items())
     raise HardwareError(
-        f"{bus.path}: the chip at 0x{address:02x} says 0x{found:02x}, expected {known}; check which board this is, "
+        f"{bus.path}: the chip at 0x{address:02x} has the id 0x{found:02x}, expected {known}; check the board, "
         "`vislam doctor` lists what answers"
     )
 
@@ -116,7 +116,7 @@ def divided(asked_hz: float, base_hz: float, most: int = 256) -> int:
 
 
 def popped(pops: Reads, units: int) -> bytes:
-    """Return so many units that a FIFO holds, each fetched by one of `MAX_READS` prepared reads; raises BusError."""
+    """Return `units` units that a FIFO holds, each fetched by one of `MAX_READS` prepared reads; raises BusError."""
     data = b""
     for first in range(0, units, MAX_READS):
         data += pops.run(min(units - first, MAX_READS))

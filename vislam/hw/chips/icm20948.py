@@ -105,7 +105,7 @@ class Icm20948:
         return Waiting(count // SAMPLE_BYTES, False)
 
     def take(self, units: int) -> RawSamples:
-        """Take so many samples; raises BusError: then `empty` it."""
+        """Take `units` samples; raises BusError: then `empty` it."""
         return decoded(popped(self._pops, units))
 
     def empty(self) -> None:

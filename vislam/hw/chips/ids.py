@@ -25,7 +25,7 @@ _ASKED_TIMES = 3  # a chip that does not answer may have been disturbed
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """What may sit at an address, and how it says so."""
+    """What may sit at an address, and how it identifies itself."""
 
     address: int
     register: int
@@ -64,7 +64,7 @@ def identify(bus: I2cBus) -> list[FoundChip]:
 
 
 def _named(bus: I2cBus, candidates: list[_Candidate]) -> FoundChip:
-    """Return the first candidate that the chip at their address says it is; unknown: what it said to the first."""
+    """Return the first candidate that the chip at their address is; unknown: what it answered to the first."""
     first = b""
     for candidate in candidates:
         answer = _asked(bus, candidate)

@@ -20,7 +20,7 @@ class KnownImu:
     chip: str  # as the settings call it
     addresses: tuple[int, ...]
     id_register: int
-    ids: dict[int, str]  # what that register says -> name of the chip
+    ids: dict[int, str]  # value of that register -> name of the chip
     make: Callable[[I2cBus, ImuSetup, int], FifoImu]
 
 
@@ -33,7 +33,7 @@ KNOWN_IMUS = (
 
 
 def find_imu(bus: I2cBus, setup: ImuSetup, chip: str = "auto", address: int | None = None) -> FifoImu:
-    """Return the chip that says by its id that it is one of these, not yet set up.
+    """Return the chip that is one of these by its id, not yet set up.
 
     Args:
         bus: on which it is.
@@ -54,7 +54,7 @@ def find_imu(bus: I2cBus, setup: ImuSetup, chip: str = "auto", address: int | No
             found = bus.read(place, known.id_register, 1)[0]
             if found in known.ids:
                 return known.make(bus, setup, place)
-            others.append(f"0x{place:02x} says 0x{found:02x} in register 0x{known.id_register:02x}")
+            others.append(f"0x{place:02x} has 0x{found:02x} in register 0x{known.id_register:02x}")
     places = ", ".join(f"0x{place:02x}" for place in sorted(set(asked)))
     what = "no inertial chip with a FIFO" if chip == "auto" else f"no {chip}"
     strangers = f" ({'; '.join(others)})" if others else ""

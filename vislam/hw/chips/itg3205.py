@@ -26,7 +26,7 @@ DELAY_S = {256: 0.00098, 188: 0.0019, 98: 0.0028, 42: 0.0048, 20: 0.0083, 10: 0.
 
 
 class Itg3205:
-    """One chip. It samples inside at 1 kHz (8 kHz at 256 Hz of bandwidth); whoever reads gets the newest sample."""
+    """One chip. It samples inside at 1 kHz (8 kHz at 256 Hz of bandwidth); a reader gets the newest sample."""
 
     name = "ITG3205"
 
@@ -46,7 +46,7 @@ class Itg3205:
         found = self._bus.read(self._address, _WHO_AM_I, 1)[0]
         if (found >> 1) & 0x3F != _ID:
             raise HardwareError(
-                f"{self._bus.path}: the chip at 0x{self._address:02x} says 0x{found:02x}, an ITG3205 says 0x68 or "
+                f"{self._bus.path}: the chip at 0x{self._address:02x} has the id 0x{found:02x}, an ITG3205 0x68 or "
                 "0x69; check which board this is"
             )
         self._bus.write(self._address, _PWR_MGM, _RESET)

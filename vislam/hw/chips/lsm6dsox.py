@@ -18,7 +18,7 @@ from vislam.hw.timing import Clock
 
 ADDRESSES = (0x6A, 0x6B)
 ID_REGISTER = 0x0F
-IDS = {0x6C: "LSM6DSOX", 0x6B: "ISM330DHCX"}  # an LSM6DSO says 0x6C, too, and is alike in all that is used here
+IDS = {0x6C: "LSM6DSOX", 0x6B: "ISM330DHCX"}  # an LSM6DSO has 0x6C, too, and is alike in all that is used here
 
 _FIFO_CTRL1, _FIFO_CTRL4, _CTRL1_XL, _CTRL3_C, _TEMPERATURE = 0x07, 0x0A, 0x10, 0x12, 0x20
 _FIFO_STATUS1, _FREQ_FINE, _FIFO_TAG = 0x3A, 0x63, 0x78

@@ -11,7 +11,7 @@ from vislam.hw.chips.qmc5883 import QMC5883L, QMC5883P, Qmc5883
 def find_magnetometer(bus: I2cBus, range_ga: float) -> Magnetometer | None:
     """Return the magnetometer of a GY-85 that answers by address and id, not yet set up; None if none does.
 
-    A DA5883 says it is an HMC5883L and shows itself by its status only; see `Hmc5883l.name`. Raises BusError.
+    A DA5883 identifies as an HMC5883L and shows itself by its status only; see `Hmc5883l.name`. Raises BusError.
     """
     address = hmc5883l.ADDRESS
     if bus.answers(address, hmc5883l.ID_REGISTER) and bus.read(address, hmc5883l.ID_REGISTER, 3) == hmc5883l.IDS:
@@ -31,13 +31,13 @@ def find_any_magnetometer(bus: I2cBus, range_ga: float) -> Magnetometer | None:
     One that is inside the inertial chip answers only once that is set up. Raises BusError.
     """
     for variant in (akm.AK09916, akm.AK8963):
-        if _says(bus, akm.ADDRESS, variant.id_register, variant.id_value):
+        if _has(bus, akm.ADDRESS, variant.id_register, variant.id_value):
             return akm.Akm(bus, variant)
     for address in lis3mdl.ADDRESSES:
-        if _says(bus, address, lis3mdl.ID_REGISTER, lis3mdl.ID):
+        if _has(bus, address, lis3mdl.ID_REGISTER, lis3mdl.ID):
             return lis3mdl.Lis3mdl(bus, range_ga, address)
     return find_magnetometer(bus, range_ga)
 
 
-def _says(bus: I2cBus, address: int, register: int, value: int) -> bool:
+def _has(bus: I2cBus, address: int, register: int, value: int) -> bool:
     return bus.answers(address, register) and bus.read(address, register, 1)[0] == value

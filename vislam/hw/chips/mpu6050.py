@@ -103,7 +103,7 @@ class Mpu6050:
         return Waiting(count // SAMPLE_BYTES, False)
 
     def take(self, units: int) -> RawSamples:
-        """Take so many samples; raises BusError: then `empty` it."""
+        """Take `units` samples; raises BusError: then `empty` it."""
         return decoded(popped(self._pops, units))
 
     def empty(self) -> None:

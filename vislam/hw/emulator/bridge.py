@@ -88,11 +88,11 @@ class BridgeEmulator:
             truth: the motion, see `sensing.Truth`.
             seed: of noise and faults.
             drift: of the device's clock, relative; 0.02 runs fast.
-            errors: of gyro, accelerometer and magnetometer; the noise of the data sheets unless told otherwise.
+            errors: of gyro, accelerometer and magnetometer; the noise of the data sheets by default.
             baud: sets how long a frame is on its way; the terminal itself has no rate.
             now_ns: the clock that truth and bytes follow.
             turned: by how many counts left and right wheel have turned at a time; None: a sketch without encoders.
-            has_receiver: the sketch passes on what `say` tells.
+            has_receiver: the sketch passes on what `say` is given.
             board: what is behind it, see `bridged`.
         """
         self.path = path
@@ -147,7 +147,7 @@ class BridgeEmulator:
         self._restart_asked.set()
 
     def say(self, data: bytes) -> None:
-        """Let the satellite receiver at the board say something; without one nobody hears it."""
+        """Let the satellite receiver at the board say something; without one it is lost."""
         if Chips.GNSS in self._chips:
             with self._lock:
                 self._said += data
@@ -165,7 +165,7 @@ class BridgeEmulator:
                 self._run_from(self._now_ns())
 
     def _run_from(self, begin_ns: int) -> None:
-        """Sample and send as the sketch does, until the board is to start anew."""
+        """Sample and send as the sketch does, until the board is to restart."""
         sequence = ticks = 0
         hello_ns, chips = begin_ns, self._chips | Chips.STARTED
         further = _Further(self._turned, begin_ns)
@@ -231,7 +231,7 @@ class BridgeEmulator:
         )  # fmt: skip
 
     def _waited_until(self, t_ns: int) -> bool:
-        """Return at a time, or earlier with False when the board is to stop or to start anew."""
+        """Return at a time, or earlier with False when the board is to stop or to restart."""
         left_s = (t_ns - self._now_ns()) / _NS
         while left_s > 0.0 and not self._interrupted():
             time.sleep(min(left_s, 0.05))
@@ -250,7 +250,7 @@ class BridgeEmulator:
             frames = self._spoiled(frames, faults)
         with self._lock:
             if self._master is not None:
-                with suppress(OSError):  # nobody listens, or the line is full
+                with suppress(OSError):  # no listener, or the line is full
                     os.write(self._master, frames)
 
     def _spoiled(self, frames: bytes, faults: LineFaults) -> bytes:
@@ -263,11 +263,11 @@ class BridgeEmulator:
 
 
 class _Greeter:
-    """How the sketch says who it is, since it started."""
+    """How the sketch identifies itself, since it started."""
 
     def __init__(self, board: Bridged) -> None:
         self._board = board
-        self._first, self._told = board.first_hellos, 0
+        self._first, self._ages_sent = board.first_hellos, 0
 
     def hellos(self) -> int:
         """Return how many hellos are due now."""
@@ -278,12 +278,12 @@ class _Greeter:
         """Return the frame before a hello, nothing where there is none."""
         if self._board.ages is None:
             return b""
-        self._told += 1
-        return encode(replace(self._board.ages, sequence=(self._told - 1) % _SEQUENCES, t_us=t_us))
+        self._ages_sent += 1
+        return encode(replace(self._board.ages, sequence=(self._ages_sent - 1) % _SEQUENCES, t_us=t_us))
 
 
 class _Further:
-    """What a board says besides, since it started."""
+    """What a board sends besides, since it started."""
 
     def __init__(self, turned: Callable[[int], tuple[float, float]] | None, begin_ns: int) -> None:
         self._turned = turned

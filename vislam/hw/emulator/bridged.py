@@ -1,4 +1,4 @@
-"""The boards that may sit behind an emulated serial bridge: what the sketch says about each, and how old counts are."""
+"""The boards that may sit behind an emulated serial bridge: what the sketch states of each, and how old counts are."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _INSIDE_NS = 1_007_000  # between samples inside such a chip, by a clock that is
 
 @dataclass(frozen=True, slots=True)
 class Bridged:
-    """What the sketch says about the chips behind it, and how their counts come about."""
+    """What the sketch states about the chips behind it, and how their counts come about."""
 
     hello: Hello
     ages: Ages | None  # None: nothing is sent

@@ -16,7 +16,7 @@ from vislam.hw.emulator.stepped_clock import SteppedClock
 _I2C_FUNC_I2C, _I2C_FUNC_SMBUS = 0x1, 0x0EFF0008
 _RETRIES, _TIMEOUT, _SLAVE, _SLAVE_FORCE, _FUNCS, _RDWR, _SMBUS = 0x701, 0x702, 0x703, 0x706, 0x705, 0x707, 0x720
 _BYTE_DATA, _BLOCK_DATA = 2, 8
-_FIRST_FD, _FDS = 1_000_000_000, 100_000_000  # no process has so many files; openings of one bus
+_FIRST_FD, _FDS = 1_000_000_000, 100_000_000  # no process has as many files; openings of one bus
 
 
 class EmulatedBus:
@@ -24,10 +24,10 @@ class EmulatedBus:
 
     Attributes:
         chips: by address; taking one out or putting one in is a change of the board.
-        nack_every: every so many transfers one is not acknowledged; 0: none.
+        nack_every: one transfer in this many is not acknowledged; 0: none.
         is_stuck: a line is held low: every transfer times out.
         busy: addresses that a kernel driver owns (only SMBus transfers ask for that).
-        transfers: so many were asked for.
+        transfers: number asked for.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class EmulatedBus:
             raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), self.path)
 
     def ioctl(self, request: int, argument: Any) -> int:
-        """Do what linux/i2c-dev.h says of a request."""
+        """Do what linux/i2c-dev.h defines for a request."""
         if not self._is_plugged:
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
         if request == _FUNCS:

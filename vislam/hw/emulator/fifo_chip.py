@@ -24,8 +24,8 @@ class FifoChip(Chip):
 
     FIFO_REGISTER = 0
     FIFO_BYTES = 512
-    IDENTITY: ClassVar[tuple[int, int]]  # register, and what the usual chip of the kind says there
-    CLEARED_BY_READING = -1  # the register that tells of an overrun, where reading it clears it
+    IDENTITY: ClassVar[tuple[int, int]]  # register, and what the usual chip of the kind has there
+    CLEARED_BY_READING = -1  # the register that reports an overrun, where reading it clears it
     gyro_delay_ns = 0
     accel_delay_ns = 0
 
@@ -75,7 +75,7 @@ class FifoChip(Chip):
     def _next(self, pointer: int) -> int:
         return pointer if pointer == self.FIFO_REGISTER else (pointer + 1) & 0xFF
 
-    # ---- what a kind of chip says of itself -------------------------------------------------------------------
+    # ---- what a kind of chip knows of itself ------------------------------------------------------------------
 
     def _rate_hz(self) -> float:
         """Return samples per second by the registers and the nominal clock."""
@@ -95,7 +95,7 @@ class FifoChip(Chip):
         return 1e9 / (self._rate_hz() * self._rate)
 
     def _pace(self, runs: bool, begins: bool) -> None:
-        """Stop sampling, the FIFO left as it is, or begin anew."""
+        """Stop sampling, the FIFO left as it is, or begin again."""
         if not runs:
             self._next_ns = math.inf
         elif begins:

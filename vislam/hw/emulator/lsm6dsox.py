@@ -24,7 +24,7 @@ class VirtualLsm6dsox(FifoChip):
     _ACCEL_MG = (0.061, 0.488, 0.122, 0.244)
 
     def power_cycle(self) -> None:
-        """Come up with both sensors off; FREQ_FINE says how far the oscillator is from its nominal rate."""
+        """Come up with both sensors off; FREQ_FINE has how far the oscillator is from its nominal rate."""
         super().power_cycle()
         self.registers[0x12], self.registers[0x18] = 0x04, 0xE0
         self.registers[0x63] = max(min(round((self._rate - 1.0) / 0.0015), 127), -128) & 0xFF

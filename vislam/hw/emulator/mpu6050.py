@@ -7,7 +7,7 @@ import struct
 from vislam.hw.emulator.fifo_chip import FifoChip
 
 _LSB_PER_DEG_S = (131.0, 65.5, 32.8, 16.4)
-_FIRST = 0x68  # what the first of them says it is
+_FIRST = 0x68  # id of the first of them
 
 
 class VirtualMpu6050(FifoChip):

@@ -22,7 +22,7 @@ _CHUNK = 512  # random numbers drawn at once
 class SensorError:
     """Errors of one chip; axes are the chip's, units those of the quantity (rad/s, m/s^2 or uT).
 
-    The chip's axes are given by the body's: `axes` ("-y", "x", "z") says that body x is the chip's -y, and so on, as
+    The chip's axes are given by the body's: `axes` ("-y", "x", "z") means that body x is the chip's -y, and so on, as
     in `config.SensorCalibration`.
     """
 
