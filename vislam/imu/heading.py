@@ -18,7 +18,7 @@ _MAG_UNDISTURBED_S = 0.5  # the field is trusted after being like the reference 
 _MAG_NEW_S = 20.0  # another field becomes the reference after so long of turning in it
 _MAG_NEW_RATE_DEG_S = 20.0  # at least as fast as this: what the body carries along would show
 _MAG_REJECT_S = 60.0  # after so long, a disturbed field is better than a gyro alone
-_MAG_REJECT_FACTOR = 2.0  # at a gain so many times lower
+_MAG_REJECT_FACTOR = 2.0  # at a gain lower by this factor
 
 
 class Heading(NamedTuple):

@@ -21,7 +21,7 @@ from vislam.core.messages import Array
 
 _WAY_M = 1.0  # the way over which a correction fades by e, where that is faster
 _REACH_M = 0.3  # how far a turn counts as way: the length of an arm, or of a cart
-_FADE_S = 0.1  # a correction fades no faster: news of single frames contradict each other
+_FADE_S = 0.1  # a correction fades no faster: corrections of single frames contradict each other
 _CREEP_S = 10.0  # and at rest a correction fades in so long
 _GYRO_SHARE = 0.5  # ... or by so much of what the gyroscope itself may err, where that is faster
 _AT_ONCE_M = 1.0  # a larger correction is another belief about the place: it comes at once

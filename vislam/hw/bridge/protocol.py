@@ -3,8 +3,8 @@
 A frame is `type, sequence, device time, body, CRC-16`, stuffed by COBS (Cheshire and Baker, 1999) and ended by a zero
 byte, all little-endian. Samples and hellos share one sequence; counts and passed bytes, which a sketch sends only where
 it has encoders or a receiver, and ages, which it sends only of chips other than a GY-85's, have one each: a host
-which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`). The structs, flags and values below are the whole
-table; firmware/vislam_bridge/vislam_bridge.ino is the other end.
+which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`).
+The structs, flags and values below are the whole table; firmware/vislam_bridge/vislam_bridge.ino is the other end.
 """
 
 from __future__ import annotations

@@ -12,15 +12,15 @@ from vislam.config import VerdictConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.runs.verdict.evidence import Evidence, Moved
 
-# of the camera's clock as told: drivers that stamp on arrival are off by up to 30 ms
+# of the camera's clock as given: drivers that stamp on arrival are off by up to 30 ms
 _CLOCK_SIGMA_S = 0.015
 _TURN_SCALE_SIGMA = 0.004  # relative, of focal length (Kalibr: 0.2 %) and of a calibrated gyro (0.3 %)
 _FORCE_SCALE_SIGMA = 0.01  # relative, of accelerometer and of baseline or depth, all calibrated
-# white noise of inertial data, in the quietest half second; what is told does not matter, for estimators learn it.
-# Flights of EuRoC have 0.1 and 0.05; beyond these two, inertial data tell less than vision between two keyframes
+# white noise of inertial data, in the quietest half second; what is stated does not matter, for estimators learn it.
+# Flights of EuRoC have 0.1 and 0.05; beyond these two, inertial data show less than vision between two keyframes
 _GYRO_NOISE_DEG = 1.0  # after a second
 _ACCEL_NOISE_M_S = 0.3  # after a second
-_RATE_ERROR = 0.2  # relative, of the inertial rate against that told: clocks are good to 3 %
+_RATE_ERROR = 0.2  # relative, of the inertial rate against that stated: clocks are good to 3 %
 _LOST_SHARE = 0.1  # of the frames that vision may lose: it finds its keyframe again, and nothing drifted ...
 _LOST_S = 1.0  # ... but not after so long: a cheap IMU alone is off by a centimetre to a decimetre then
 _DEGRADED_SHARE = 0.2  # of the frames on which vision may lean weakly
@@ -32,7 +32,7 @@ _UNIFORM_S = 20.0  # one camera without motion that shows scale: biases have wal
 _SIGMA_M = 1.0  # of the filter's position at its worst: no controller can use it
 # rms between filter and graph over what both admit: independent models would differ by 1
 _APART_SIGMAS = 3.0
-_APART_SHARE = 0.005  # of the way: closer together than this they tell the same story, whatever they admit
+_APART_SHARE = 0.005  # of the way: closer together than this they agree, whatever their covariances
 _MIN_FRAMES = 30  # before shares of them mean anything
 _MIN_LOOPS = 8
 _MIN_KEYFRAMES = 10
