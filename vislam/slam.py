@@ -35,7 +35,7 @@ class Slam:
     ) -> None:  # fmt: skip
         """Build the pipeline for a rig; without `noise` there is no IMU. `suite` are further sensors, if any.
 
-        `labeller` tells the labels of keyframes, as a network does; None: `map.labels.folder` does, if there is one.
+        `labeller` gives the labels of keyframes, as a network does; None: `map.labels.folder` does, if there is one.
         """
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock, suite)

@@ -150,8 +150,8 @@ def test_every_logger_gives_the_same_motion(tmp_path, make, kind, scheme):
         (sensor_logger, "android", "Sensor Logger on android: TotalAcceleration.csv is interpolated at the stamps of"),
         (sensor_logger, "ios", "Accelerometer.csv and Gravity.csv are added, negated as it is Apple's"),
         (mars, "ios", "MARS logger: forces were interpolated"),
-        (advio, "g", "is taken as g, as its description says"),
-        (advio, "m/s^2", "is taken as m/s^2, though its description says g"),
+        (advio, "g", "is taken as g, as its description states"),
+        (advio, "m/s^2", "is taken as m/s^2, though its description states g"),
     ],
 )
 def test_doctor_says_what_was_made_of_the_tables(tmp_path, make, kind, said):

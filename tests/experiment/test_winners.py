@@ -9,7 +9,7 @@ from test_statistics import trial
 from vislam.experiment.plan import Axis, Estimator, Plan, Sequence
 from vislam.experiment.report.exports import winners_csv
 from vislam.experiment.statistics import compare, groups
-from vislam.experiment.winners import of_plan, of_sequences, told, verdict
+from vislam.experiment.winners import of_plan, of_sequences, outcome, verdict
 
 SEQUENCES = [f"s{i}" for i in range(8)]
 
@@ -25,7 +25,7 @@ def test_who_is_better_than_every_other_one_wins_by_the_margin_to_the_nearest():
     (winner,) = of_plan(compare(over_sequences(a=1.0, b=0.8, c=2.0), "ate_m"))
     assert (winner.estimate, winner.runner_up, winner.kind) == ("b filter, causal", "a filter, causal", "causal")
     assert winner.margin == pytest.approx(0.2)
-    assert told(winner) == "ATE, causal: b filter, causal, 20% less than a filter, causal (p 0.0234, 8 pairs)"
+    assert outcome(winner) == "ATE, causal: b filter, causal, 20% less than a filter, causal (p 0.0234, 8 pairs)"
 
 
 def test_no_difference_has_no_winner_and_says_between_whom():
@@ -34,7 +34,7 @@ def test_no_difference_has_no_winner_and_says_between_whom():
     (winner,) = of_plan(compare(noisy, "ate_m"))
     assert winner.estimate == ""
     assert math.isnan(winner.margin)
-    assert "a filter, causal and b filter, causal cannot be distinguished (p 0." in told(winner)
+    assert "a filter, causal and b filter, causal cannot be distinguished (p 0." in outcome(winner)
 
 
 def test_with_few_pairs_nobody_can_win():

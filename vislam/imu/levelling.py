@@ -19,7 +19,7 @@ from vislam.imu.low_pass import low_pass
 
 _TAU_S = 3.0  # vqf: the force is averaged over it, at least
 _TAU_MAX_S = 10.0  # at most, while the body keeps its tilt
-_SPEED_CHANGE_M_S = 1.0  # a walk or a cart that starts; with the next it says what lies between the two
+_SPEED_CHANGE_M_S = 1.0  # a walk or a cart that starts; with the next it states what lies between the two
 _GYRO_ERROR = 0.05  # share of the rate: scale is +-6 % and cross-axis 2 % of an ITG3205 as it comes
 # a body that tilted is remembered for so long: each change of tau lets some motion through
 _SWAY_S = 60.0

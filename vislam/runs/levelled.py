@@ -1,7 +1,7 @@
 """Which way is up in a finished run without gravity, and what is final of it turned so that z of `map` is up.
 
 What was published while the run went on (`odom`, the causal trajectories, the viewer's recording) and the session stay
-in the axes of the first image; decision 10 says why.
+in the axes of the first image; decision 10 has the reason.
 """
 
 from __future__ import annotations

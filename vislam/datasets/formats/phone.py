@@ -265,7 +265,7 @@ def _of_advio(path: Path) -> tuple[ImuRows, list[Finding]]:
     norms = [math.hypot(*row[1]) for row, _ in zip(rows, range(_LOOKED_AT), strict=False)]
     usual = float(np.median(norms)) if norms else math.nan
     in_g = usual < 0.5 * _STANDARD_GRAVITY_M_S2
-    unit = "g, as its description says" if in_g else "m/s^2, though its description says g"
+    unit = "g, as its description states" if in_g else "m/s^2, though its description states g"
     what = (
         f"ADVIO: accelerometer.csv of usually {usual:.2f} is taken as {unit}; interpolated at the stamps of the rates"
     )

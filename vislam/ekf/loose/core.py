@@ -47,7 +47,7 @@ from vislam.sensors import Suite
 
 # fixed R of accumulated vision; 0.005 to 0.1 err alike, below this motions fail
 _ACCUMULATED_SIGMA_M = 0.02
-_ACCUMULATED_SIGMA_DEG = 0.5  # the gate, for the sum has drifted by more than R says
+_ACCUMULATED_SIGMA_DEG = 0.5  # the gate, for the sum has drifted by more than R states
 
 
 LooseMeasurement = VoMeasurement | NewKeyframe | OnWheels

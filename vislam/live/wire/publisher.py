@@ -15,7 +15,7 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def socket_path(name: str) -> Path:
-    """Return where datagrams go by default: in the user's runtime folder, else in /tmp."""
+    """Return the default destination of datagrams: in the user's runtime folder, else in /tmp."""
     return Path(os.environ.get("XDG_RUNTIME_DIR", "/tmp")) / f"{name}.sock"
 
 

@@ -54,7 +54,7 @@ def packet_of(t_ns: int, row: tuple[Any, ...]) -> KeyframePacket:
     ids, noise = integers(row[8]), float(row[12])
     n = len(ids)
     if not 1.0 <= noise < math.inf:
-        raise ValueError(f"tracks cannot have {noise:g} times the noise that is told")
+        raise ValueError(f"tracks cannot have {noise:g} times the noise that is given")
     observations = Observations(
         ids, numbers(row[9], "<f4", (n, 2)), maybe_numbers(row[10], "<f4", (n, 2)), maybe_numbers(row[11], "<f4", (n,)),
         noise=noise,

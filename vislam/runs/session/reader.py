@@ -146,7 +146,7 @@ class Session:
                 return {}
             newest: dict[str, Any] = json.loads(row[0])
             if not newest:
-                raise ValueError("the last commit says nothing")
+                raise ValueError("the last commit is empty")
             return newest
 
     def rows(self, query: str) -> Iterator[tuple[Any, ...]]:

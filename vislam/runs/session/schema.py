@@ -16,7 +16,7 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array, NavState
 
-APPLICATION_ID = 0x5649534C  # "VISL": tells our files from other SQLite files
+APPLICATION_ID = 0x5649534C  # "VISL": distinguishes our files from other SQLite files
 SCHEMA_VERSION = 10
 OLDEST_VERSION = 8  # read as well; it knows no readings of other sensors, and no labels
 FIRST_WITH_READINGS, FIRST_WITH_LABELS = 9, 10

@@ -56,7 +56,7 @@ class SessionWriter:
         """
         self._open(path)
         sensors = {"rig": rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
-        with storage(path), self._transaction():  # half of the tables would be a file that nobody can open again
+        with storage(path), self._transaction():  # half of the tables would be a file that cannot be opened again
             self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
             for statement in schema(SCHEMA_VERSION).split(";"):
                 self._db.execute(statement)
@@ -221,13 +221,13 @@ class SessionWriter:
     def close(self, finished: bool = False) -> None:
         """Fold the write-ahead log into the file, which is then all there is, and close it.
 
-        `finished` says that the run came to its end and is not to be resumed.
+        `finished`: the run came to its end and is not to be resumed.
         """
         with storage(self.path):
             with self._transaction():
                 self._write_frames()
                 self._tell({"finished": finished})
-            with suppress(sqlite3.OperationalError):  # somebody reads it: all is committed, and the log stays beside
+            with suppress(sqlite3.OperationalError):  # a reader has it open: all is committed, and the log stays beside
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
                 self._db.execute("PRAGMA journal_mode=DELETE")  # so that readers leave no files beside it
             self._db.close()
