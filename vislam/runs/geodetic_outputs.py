@@ -161,8 +161,8 @@ def _write(
         if (most := sigmas[by]) is None:
             table = csv_text(COLUMNS, rows)
         else:
-            sigmas = [[f"{sigma:.{_HEIGHT_DIGITS}f}" for sigma in row] for row in most.tolist()]
-            table = csv_text(COLUMNS + SIGMA_COLUMNS, [(*row, *of) for row, of in zip(rows, sigmas, strict=True)])
+            shown = [[f"{sigma:.{_HEIGHT_DIGITS}f}" for sigma in row] for row in most.tolist()]
+            table = csv_text(COLUMNS + SIGMA_COLUMNS, [(*row, *of) for row, of in zip(rows, shown, strict=True)])
         write_text(out / TABLES[by], table)
     write_text(out / LINES, json.dumps(lines_on_a_map(places)) + "\n")
 

@@ -227,8 +227,8 @@ class Telemetry:
         by_count = _by_count(counted, counts, begins_s, ends_s)
         begin_s, period_s = self._by_stamps(counted, counts, by_count[1]) or by_count
         known = zip(payloads.tolist(), begin_s.tolist(), period_s.tolist(), strict=True)
-        known = [(index, begin, period) for index, begin, period in known if math.isfinite(begin) and period > 0.0]
-        return _Times({i: begin for i, begin, _ in known}, {i: period for i, _, period in known})
+        timed = [(index, begin, period) for index, begin, period in known if math.isfinite(begin) and period > 0.0]
+        return _Times({i: begin for i, begin, _ in timed}, {i: period for i, _, period in timed})
 
     def _by_stamps(self, counted: _Counted, counts: NDArray[np.int64], usual_s: Array) -> tuple[Array, Array] | None:
         """Return begin and period of each payload by the camera's own stamps; None where they cannot be used."""
