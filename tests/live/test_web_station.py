@@ -71,7 +71,7 @@ def test_a_run_is_told_of_and_ended_from_the_page_and_outlives_it(station: Stati
     pages = [p for p in psutil.Process().children() if "spawn_main" in " ".join(p.cmdline())]
     assert len(pages) == 1
     pages[0].kill()
-    monkeypatch.setattr("vislam.live.web.station._TELL_S", 0.0)
+    monkeypatch.setattr("vislam.live.web.station._SHOW_S", 0.0)
     with caplog.at_level(logging.WARNING):
         until(lambda: (station.follow(run), not station.is_well)[1])
         for _ in range(20):

@@ -215,7 +215,7 @@ def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
     rates = _of_axes(path / "Gyroscope.csv", 1.0)
     if (path / "TotalAcceleration.csv").is_file():
         forces = _of_axes(path / "TotalAcceleration.csv", factor)
-        what = f"{app}:  TotalAcceleration.csv is interpolated at the stamps of Gyroscope.csv"
+        what = f"{app}: TotalAcceleration.csv is interpolated at the stamps of Gyroscope.csv"
         return _Pair(rates, forces), [Finding("ok", what, path.name)]
     if not (path / "Accelerometer.csv").is_file():
         raise DataError(
@@ -233,7 +233,7 @@ def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
         )
     forces, gravity = (_of_axes(path / name, factor) for name in ("Accelerometer.csv", "Gravity.csv"))
     sign = ", negated as it is Apple's" if factor < 0.0 else ""
-    what = f"{app}:  Accelerometer.csv and Gravity.csv are added{sign} and interpolated at the stamps of Gyroscope.csv"
+    what = f"{app}: Accelerometer.csv and Gravity.csv are added{sign} and interpolated at the stamps of Gyroscope.csv"
     return _Pair(rates, forces, gravity), [Finding("ok", what, path.name)]
 
 
