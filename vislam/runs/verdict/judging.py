@@ -228,8 +228,7 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         yield (
             f"inertial samples come every {period_s:.2f} s and more than {e.max_gap_s:.2f} s is an outage: filter and "
             "graph went without them, and without the readings between them; state their rate in the IMU's sensor file "
-            "(3 Hz at least), or raise --imu.max-gap-s, --ekf.max-gap-s, --window.imu-max-gap-s and "
-            "--graph.imu-max-gap-s"
+            "(3 Hz at least), or raise --machine.max-gap-s"
         )
     elif off > _RATE_ERROR and not _misses_samples(e):
         yield f"inertial samples come at {e.rate_hz:.0f} Hz, stated were {e.rate_told_hz:.0f}: look for what loses them"
