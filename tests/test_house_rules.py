@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from vislam.config import Config, GraphWorldConfig, LoopTruthConfig, PoseGraphConfig, RecordConfig, SensorsConfig
+from vislam.config.ranges import settings_of
+
 TESTS = Path(__file__).resolve().parent
 VISLAM = TESTS.parent / "vislam"
 MAX_TOP_NAMES = 24
@@ -77,6 +80,9 @@ def imports() -> dict[str, set[str]]:
 
 def lines_of(folder: Path) -> dict[Path, int]:
     return {path: len(path.read_text(encoding="utf-8").splitlines()) for path in folder.rglob("*.py")}
+
+
+MAX_SETTINGS = 486  # of all sections together; only a commit that says why raises it
 
 
 def top_names() -> list[str]:
@@ -214,3 +220,9 @@ def test_private_state_is_read_by_fewer_tests_only():
 def test_arguments_of_kernels_are_counted():
     source = "@njit(cache=True)\ndef f(a, b, *, c): ...\n@numba.njit\ndef g(): ...\ndef h(a): ...\n"
     assert list(kernels(source)) == [("f", 3), ("g", 0)]
+
+
+def test_settings_stay_within_their_budget():
+    """Each setting is one that somebody has a reason to change; a constant stands beside the code that uses it."""
+    trees = (Config, SensorsConfig, RecordConfig, PoseGraphConfig, GraphWorldConfig, LoopTruthConfig)
+    assert sum(1 for tree in trees for _ in settings_of(tree)) <= MAX_SETTINGS

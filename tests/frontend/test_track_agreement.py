@@ -60,10 +60,10 @@ def test_a_failed_motion_is_replaced_by_one_that_the_filter_supports() -> None:
 
 
 def test_the_first_reason_is_told() -> None:
-    assert failure(100, 10, 10, True, 15, CONFIG) == "only 10 of 100 tracks found"
-    assert failure(100, 90, 80, False, 15, CONFIG) == "the motion does not converge"
-    assert failure(100, 90, 20, True, 15, CONFIG) == "only 20 of 90 tracks agree on a motion"
-    assert failure(100, 90, 80, True, 15, CONFIG) == ""
-    assert weakness(90, 30, 40, CONFIG) == "only 30 inliers"
-    assert weakness(90, 44, 40, CONFIG) == "only 44 of 90 tracks agree"
-    assert weakness(90, 80, 40, CONFIG) == ""
+    assert failure(100, 10, 10, True, 15) == "only 10 of 100 tracks found"
+    assert failure(100, 90, 80, False, 15) == "the motion does not converge"
+    assert failure(100, 90, 20, True, 15) == "only 20 of 90 tracks agree on a motion"
+    assert failure(100, 90, 80, True, 15) == ""
+    assert weakness(90, 30, 40) == "only 30 inliers"
+    assert weakness(90, 44, 40) == "only 44 of 90 tracks agree"
+    assert weakness(90, 80, 40) == ""

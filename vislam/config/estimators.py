@@ -32,7 +32,6 @@ class EkfConfig:
     submap_sigma_m: NonNegative = 5.0
     graph_feedback: bool = False  # take biases from the graph; off, the filter alone is the honest baseline
 
-    tight_clones: Count = 11  # past poses that tracks tie together; half a second at 20 Hz
     # on the pixel sigma of such points: real corners err alike in frame after frame; and even with white noise at 1 the
     # filter is too sure of itself (100 runs: NEES of position 4.6 of 3; at 3 it is 2.7)
     tight_point_inflation: Positive = 3.0

@@ -30,9 +30,6 @@ class ImuConfig:
     gyro_scale_prior: NonNegative = 0.003  # of a calibrated MEMS gyroscope: data sheets give 0.2 to 1 %
     accel_scale_prior: NonNegative = 0.01  # of a calibrated MEMS accelerometer: 0.5 to 1 % against motion capture
     buffer_s: Positive = 30.0  # history kept for spans; longer than any keyframe interval, and 30 s at 400 Hz is 0.7 MB
-    # a run whose quietest second has less than a third of the white noise told is warned
-    noise_tolerance: Positive = 3.0
-    max_wait_s: NonNegative = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
     vibration: VibrationConfig = field(default_factory=VibrationConfig)
 
 

@@ -48,16 +48,12 @@ class MonoDepthConfig:
     converged: Share = 0.02  # sigma of inverse depth over its mean; on TUM fr1_desk 0.01 finds a quarter less
     min_matches: Whole = 3
     max_misses: Whole = 6  # more than matches by so many: hidden, moving or too alike, and not searched any more
-    min_good: Share = 0.6  # share of good measurements (REMODE); half of it, and the pixel has failed
     min_depth_m: NonNegative = 0.3  # nearer, frames share too little
     max_depth_m: NonNegative = 20.0
     # an image turned by more is turned back, which leaves out what does not fit; without warped patches 1.5 is good
     derotate_deg: NonNegative = 180.0
     handover_sigma: NonNegative = 0.05  # of inverse depth that the next keyframe takes over; it measures anew
-    smoothing: Whole = 10  # steps of smoothing inside surfaces; 0: none
-    frames_per_keyframe: Count = 6  # used between two keyframes, the newer one included; bounds the time
     keyframes: Count = 3  # later ones that feed a keyframe before the next is begun; more parallax, fewer depth images
-    min_overlap: Share = 0.5  # of the image that later ones must still see; less, and the next is begun at once
     max_range_m: NonNegative = 8.0  # farther points only clear the way
     threads: Count = 2  # the result does not depend on it
 
@@ -68,7 +64,6 @@ class LabelConfig:
 
     # label images, named by the stamps of the colour images, beside labels.toml; None: no labels
     folder: str | None = None
-    max_voxels: Count = 1_000_000  # that have labels, 40 MB; what is seen after that has none
     thing_voxels: Count = 8  # connected voxels of one class that are a thing; fewer are stray
     cloud_colors: bool = False  # the cloud and surfels have the colours of labels, not of images
 
@@ -90,7 +85,6 @@ class MapConfig:
     min_range_m: NonNegative = 0.3  # nearer, structured-light depth and stereo matching are not valid
     max_range_m: NonNegative = 4.0  # of depth, whose noise grows with the square; farther points clear the way to here
     pixel_step: Count = 2  # keep every n-th row and column of a depth image; at 4 m still 3 pixels per voxel
-    edge_ratio: Share = 0.03  # a step to a neighbour pixel of more than this share of depth is an object's border
     edge_px: Whole = 2  # pixels left out on both sides of such a border, where sensors mix near and far
     speckle_pixels: Whole = 40  # smaller connected surfaces, in kept pixels, are noise
     stereo_scale: PositiveShare = 0.5  # image scale for dense stereo; 15 to 30 ms per keyframe, at 1.0 five times that

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from vislam.config.frontend import CalibrationConfig
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Share
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range
 
 ImuChip = Literal["auto", "lsm6dsox", "mpu6050", "icm20948", "bmi270"]
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -38,7 +38,6 @@ class Gy85Config:
     """The GY-85 board (ADXL345, ITG3205, HMC5883L or a clone of it) on an I2C bus."""
 
     bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
-    bus_timeout_s: NonNegative = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
     rate_hz: Positive = 400.0  # of samples; 30 % of a 400 kHz bus. On a 100 kHz bus ask for 100
     gyro_bandwidth_hz: Literal[256, 188, 98, 42, 20, 10, 5] = 98  # below half the rate: the chip cannot be aliased
     gyro_delay_s: NonNegative | None = None  # of that filter, taken off the stamps; None: what its makers state
@@ -50,9 +49,7 @@ class Gy85Config:
     self_test: bool = True  # at the start, 1 s, standing still; docs/sensors.md
     supply_v: Positive = 3.3  # of the accelerometer: its self-test limits grow with it
     reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away; one costs up to 0.1 s
-    nacks_to_reopen: Count = 5  # in a row until a chip counts as gone: single ones are noise on the wire
     silent_s: NonNegative = 0.1  # without a sample, a chip is set up again, and the source says that it is missing
-    stuck_samples: Count = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
     max_temperature_change_c: NonNegative = 10.0  # since the biases were taken; an ITG3205 then drifts by up to 1 deg/s
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
@@ -64,7 +61,6 @@ class BoardConfig:
     chip: ImuChip = "auto"  # a family, known by its id; auto: whichever answers
     bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
     address: Count | None = None  # None: wherever such a chip can be
-    bus_timeout_s: NonNegative = 0.02  # of one transfer, in steps of 10 ms
     rate_hz: Positive = 200.0  # or the next higher rate that the chip has; 400 Hz need a bus of 400 kHz
     gyro_range_deg_s: Literal[250, 500, 1000, 2000] = 500  # a cart turns by 200 at most; in the hand ask for 2000
     accel_range_g: Literal[2, 4, 8, 16] = 8  # wheels on thresholds give 5
@@ -74,9 +70,7 @@ class BoardConfig:
     mag_rate_hz: Positive = 50.0  # how often it is asked
     mag_range_ga: Positive = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
     reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away
-    nacks_to_reopen: Count = 5  # in a row until a chip counts as gone: single ones are noise on the wire
     silent_s: NonNegative = 0.1  # without a sample, the chip is set up again, and the source says that it is missing
-    stuck_samples: Count = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
     max_temperature_change_c: NonNegative = 10.0  # since the biases were taken
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
@@ -85,13 +79,8 @@ class BoardConfig:
 class BridgeClockConfig:
     """The line that turns the serial bridge's clock into the host's."""
 
-    window_s: NonNegative = 20.0  # of arrivals that the line is laid under; 0.1 ms of jitter then costs 5 ppm of rate
     bin_s: Positive = 0.1  # the least delayed arrival of each counts; the line is laid anew so often
     settle_s: NonNegative = 0.5  # no sample is passed before the rate has been seen for so long
-    max_drift: Share = 0.025  # of the rate; a ceramic resonator, as on an Arduino Nano, is off by up to 0.5 %
-    step_s: NonNegative = 0.1  # before its time by so much is no jitter: the device restarted or the host slept
-    late_s: NonNegative = 2.0  # everything late by step_s for so long: the device's clock lost time
-    max_slew: Share = 0.05  # share of an interval by which a better line may stretch it: 5 ms are caught up in 0.1 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,14 +89,11 @@ class SerialConfig:
 
     port: str = "/dev/ttyUSB0"  # the path in /dev/serial/by-id stays the same when other devices come and go
     baud: Count = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
-    chips_s: NonNegative = 0.0005  # from a sample's time to its first byte: reading two chips at 400 kHz
     filter_s: NonNegative = 0.0033  # delay of the gyro's 98 Hz filter, and half a millisecond of its sampling
-    mag_delay_s: NonNegative = 0.0067  # half a period of 75 Hz
     missing_s: NonNegative = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
     # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it anew
     start_s: NonNegative = 4.0
     reopen_s: NonNegative = 0.5  # between attempts to open a port that is not there
-    stuck_s: NonNegative = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
     calibrated_at_c: Finite | None = None  # temperature of the gyro when its biases were taken
     max_temperature_change_c: NonNegative = 10.0  # from it; an ITG3205 then drifts by up to 1 deg/s
     clock: BridgeClockConfig = field(default_factory=BridgeClockConfig)
@@ -132,7 +118,6 @@ class WebcamConfig:
     buffers: Count = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
     # from capture to arrival, where the driver's stamps cannot be used: exposure, readout, USB
     delay_s: NonNegative = 0.05
-    max_age_s: NonNegative = 1.0  # of a stamp at arrival; older, it is from another clock
     missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
     start_s: NonNegative = 5.0  # until the first image; some cameras take 2 s
     reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there
@@ -149,7 +134,6 @@ class LibraryCameraConfig:
     # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera
     exposure_s: NonNegative | None = 0.01
     gain: NonNegative | None = None  # in units of the camera; None: its own
-    max_age_s: NonNegative = 1.0  # of a stamp at arrival; older, it is from another clock
     missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
     start_s: NonNegative = 10.0  # until the first image; a device that loads its firmware takes some seconds
     reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there

@@ -16,6 +16,11 @@ from vislam.frontend.view import DepthReading
 from vislam.imu.gyro_turns import integrate_gyro
 from vislam.vision.refine import PoseEstimate
 
+DEGRADED_INLIERS = 40  # fewer: degraded
+_MIN_INLIER_RATIO = 0.3  # of the followed tracks; below, the agreement may be chance
+DEGRADED_INLIER_RATIO = 0.5  # of the followed tracks
+_MIN_EXPECTED_SHARE = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
+
 
 def gyro_rotation(span: ImuSpan) -> Array:
     """Return R_first_last [3, 3] of the body over a span, by trapezoidal integration of the angular rate."""
@@ -92,26 +97,26 @@ def confirmed(placing: T, astray: NDArray[np.bool_], place: Callable[[Array], T]
     if not placing.failure and (astray & placing.agreeing).sum() <= config.contradicting_share * agree:
         return placing
     other = place(np.where(astray[:, None], np.nan, placing.pixels))
-    few = int(other.agreeing.sum()) < config.min_expected_share * placing.followed
+    few = int(other.agreeing.sum()) < _MIN_EXPECTED_SHARE * placing.followed
     return placing if few or other.failure else other
 
 
-def failure(tracks: int, followed: int, agree: int, converged: bool, least: int, config: FrontEndConfig) -> str:
+def failure(tracks: int, followed: int, agree: int, converged: bool, least: int) -> str:
     """Return why a motion on which tracks `agree` cannot be trusted, or an empty string; `least` have to be found."""
     if followed < least:
         return f"only {followed} of {tracks} tracks found"
     if not converged:
         return "the motion does not converge"
-    if agree < max(least, config.min_inlier_ratio * followed):
+    if agree < max(least, _MIN_INLIER_RATIO * followed):
         return f"only {agree} of {followed} tracks agree on a motion"
     return ""
 
 
-def weakness(followed: int, agree: int, enough: int, config: FrontEndConfig) -> str:
+def weakness(followed: int, agree: int, enough: int) -> str:
     """Return why tracking is degraded, or an empty string; fewer than `enough` tracks that agree are a reason."""
     if agree < enough:
         return f"only {agree} inliers"
-    if agree < config.degraded_inlier_ratio * followed:
+    if agree < DEGRADED_INLIER_RATIO * followed:
         return f"only {agree} of {followed} tracks agree"
     return ""
 

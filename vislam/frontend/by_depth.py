@@ -16,9 +16,14 @@ from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, Frame, Keyframe, Tracking, VoMeasurement
 from vislam.frontend.local_surfaces import WIDER, LocalSurfaces, is_alike
 from vislam.frontend.result import metric_motion
+from vislam.frontend.tracker import MIN_START_CORNERS
 from vislam.frontend.view import sees
 from vislam.vision.depth_alignment import DepthAlignment, Prior, align_depth
 
+_DEPTH_ALONE_RENEW = 0.6  # overlap below which a new keyframe begins; each costs drift
+_DEPTH_ALONE_OVERLAP = 0.4  # of its surface that falls on the last keyframes'; less fits by chance
+# between the exposures of depth and colour of a frame: TUM's pairs are up to 16 ms apart, and depth is stamped late
+DEPTH_APART_S = 0.03
 _TURN_WALK, _SPEED_WALK = 2.0, 0.7  # rad/s and m/s per root of a second: 6 rad/s^2, 2 m/s^2 of a hand over 0.1 s
 _TURN_SIGMA, _SPEED_SIGMA = 0.3, 0.2  # rad/s and m/s, of what the last two frames that vision placed say
 _CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
@@ -91,7 +96,7 @@ class ByDepth:
         T_cam_depth = se3_exp((frame.depth_lag_s + moved.depth_delay_s) * now)
         to_cam = se3_adjoint(T_cam_depth)
         to_depth = np.linalg.inv(to_cam)
-        off = self._config.depth_apart_s**2 * (np.outer(now, now) + np.outer(at_key, at_key))
+        off = DEPTH_APART_S**2 * (np.outer(now, now) + np.outer(at_key, at_key))
         known = to_depth @ (covariance[:6, :6] + off) @ to_depth.T + 1e-10 * np.eye(6)
         prior = Prior(np.asarray(moved.T_guess @ T_cam_depth), known)
         found = align_depth(of_frame, model, prior, WIDER * self._config.depth_sigma_rho)
@@ -138,18 +143,16 @@ class ByDepth:
     def _is_trusted(self, found: DepthAlignment, prior: Prior) -> bool:
         change = se3_log(invert(prior.T_model_cam) @ found.T_model_cam)
         chi2 = float(change @ np.linalg.solve(prior.covariance, change))
-        return (
-            found.converged and found.overlap >= self._config.depth_alone_overlap and is_alike(found) and chi2 <= _CHI2
-        )
+        return found.converged and found.overlap >= _DEPTH_ALONE_OVERLAP and is_alike(found) and chi2 <= _CHI2
 
     def _keyframe_reason(self, frame: Frame, keyframe: Keyframe, found: DepthAlignment, tracks: int) -> str:
         config = self._config
         dt_s = (frame.t_ns - keyframe.t_ns) * 1e-9
         if dt_s < config.keyframe_min_interval_s:
             return ""
-        if tracks < config.min_start_corners and frame.images and sees(frame.images[0], config):
+        if tracks < MIN_START_CORNERS and frame.images and sees(frame.images[0], config):
             return "there is something to see again"
-        if found.overlap < config.depth_alone_renew:
+        if found.overlap < _DEPTH_ALONE_RENEW:
             return f"only {found.overlap:.0%} of the depth overlaps"
         return f"{dt_s:.1f} s since the last keyframe" if dt_s >= config.keyframe_max_interval_s else ""
 

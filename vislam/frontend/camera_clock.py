@@ -16,6 +16,7 @@ from vislam.core.messages import Frame, ImuSpan, NavState, VoMeasurement
 from vislam.frontend.time_offset import TimeOffset, TimeOffsetEstimate
 from vislam.imu import ImuBuffer
 
+_TIME_OFFSET_MIN_S = 0.001  # smaller corrections are not worth a step in time
 _NS = 1_000_000_000
 _EVERY_FRAMES = 5  # between estimates: they change slowly, and each costs a millisecond
 _SIGNIFICANT = 3.0  # sigmas of the estimate
@@ -139,7 +140,7 @@ class CameraClock:
         if now_ns is None:
             return 0
         shift_ns = round(found.at(now_ns) * _NS) - self.applied_ns
-        needed_s = max(_SIGNIFICANT * found.sigma_s, self._config.time_offset_min_s)
+        needed_s = max(_SIGNIFICANT * found.sigma_s, _TIME_OFFSET_MIN_S)
         return shift_ns if abs(shift_ns) >= needed_s * _NS else 0
 
     def _change(self, shift_ns: int) -> int:

@@ -11,9 +11,9 @@ from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
 from vislam.frontend.attempt import Attempt, MotionPredictor
 from vislam.frontend.exposures import Exposures
-from vislam.frontend.keyframes import Exposed
+from vislam.frontend.keyframes import PATIENCE_S, Exposed
 from vislam.frontend.tracker import Tracker, given_rows
-from vislam.frontend.view import DepthReading, View, spread
+from vislam.frontend.view import EPIPOLAR_GATE_PX, DepthReading, View, spread
 from vislam.vision.landmarks import Landmarks, move
 
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
@@ -39,7 +39,7 @@ class KeyframeTracks:
         self.tracker = Tracker(config)
         self.landmarks = Landmarks()
         self.exposures = Exposures(usual.camera, config)
-        self.predictor = MotionPredictor(usual.T_body_cam, config.patience_s)
+        self.predictor = MotionPredictor(usual.T_body_cam, PATIENCE_S)
         self.T_key_cam: Array = np.eye(4)
         self.lacks_depth = False
         self._config = config
@@ -175,7 +175,7 @@ class KeyframeTracks:
         )
 
     def _as_usual_would(self, ids: NDArray[np.int64], xy: Array, means: Array, covariances: Array) -> Observations:
-        gate_px = self._config.epipolar_gate_px
+        gate_px = EPIPOLAR_GATE_PX
         return self.view.as_other_would(self.usual, ids, xy, means, covariances, gate_px)
 
     # -- another camera of the rig -----------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ class KeyframeTracks:
         landmarks = Landmarks()
         landmarks.mean, landmarks.covariance = self.view.carry(self.landmarks.mean, self.landmarks.covariance, view)
         self.look_through(view)
-        vague = view.camera.fx * spread(landmarks.covariance) > self._config.epipolar_gate_px
+        vague = view.camera.fx * spread(landmarks.covariance) > EPIPOLAR_GATE_PX
         landmarks.mean[vague] = np.nan
         # from here on the landmark is the patch at this place, and no longer the one that the other camera saw
         landmarks.pin(_CORNER_SIGMA * self.sigma_xy)

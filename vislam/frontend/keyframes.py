@@ -15,6 +15,11 @@ from vislam.core.messages import Array, Frame, Keyframe, Observations, no_observ
 from vislam.frontend.result import TrackResult, identity_motion, lost_motion
 from vislam.vision.features import describe
 
+PATIENCE_S = 0.4  # so long a lost keyframe is searched for before a new one starts
+_KEYFRAME_ROTATION_DEG = 15.0  # patches turn with the camera and stop matching
+_KEYFRAME_MIN_ALIVE = 0.45  # fraction of the keyframe's tracks that are still followed
+_RESTART_KEYFRAMES = 8  # after a loss, so many come as soon as they may: chances to recognise the place
+
 
 @dataclass(frozen=True, slots=True)
 class Departure:
@@ -36,7 +41,7 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig, spacing: float
     makes sure that the graph hears of a camera that hardly moves. `spacing` widens the distances and times: 1 where
     the back end keeps up.
     """
-    least = config.keyframe_min_alive if departure.fit else config.keyframe_min_alive_unfit
+    least = _KEYFRAME_MIN_ALIVE if departure.fit else config.keyframe_min_alive_unfit
     if departure.alive < least:
         return f"only {departure.alive:.0%} of the tracks left"
     if not departure.fit or departure.dt_s < spacing * config.keyframe_min_interval_s:
@@ -48,7 +53,7 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig, spacing: float
     turned_deg = float(np.rad2deg(departure.rotation_rad))
     limits = (
         (departure.parallax_px, config.keyframe_parallax_px, f"parallax of {departure.parallax_px:.0f} px"),
-        (turned_deg, config.keyframe_rotation_deg, f"turned by {turned_deg:.0f} deg"),
+        (turned_deg, _KEYFRAME_ROTATION_DEG, f"turned by {turned_deg:.0f} deg"),
         (departure.dt_s, config.keyframe_max_interval_s, f"{departure.dt_s:.1f} s since the last keyframe"),
     )
     return next((reason for value, limit, reason in limits if value >= spacing * limit), "")
@@ -108,7 +113,7 @@ class KeyframeLife:
         self.keyframe: Keyframe | None = None
         self._config = config
         self._has_scale = has_scale
-        self._since_restart = config.restart_keyframes  # keyframes; that many: long ago
+        self._since_restart = _RESTART_KEYFRAMES  # keyframes; that many: long ago
         self._first_id = 0
         self._tracks = 0  # with which the keyframe began
         self._t_placed_ns = -1  # of the last frame that was placed
@@ -134,7 +139,7 @@ class KeyframeLife:
 
     def is_given_up(self, t_ns: int) -> bool:
         """Return whether no frame was placed for so long that another keyframe has to begin."""
-        return (t_ns - self._t_placed_ns) * 1e-9 >= self._config.patience_s
+        return (t_ns - self._t_placed_ns) * 1e-9 >= PATIENCE_S
 
     def departure(
         self, t_ns: int, R_key_cam: Array, parallax_px: float, followed: int, inliers: int, fit: bool = True
@@ -148,7 +153,7 @@ class KeyframeLife:
             alive=followed / max(self._tracks, 1),
             inliers=inliers,
             fit=fit,
-            restarted=self._since_restart < self._config.restart_keyframes,
+            restarted=self._since_restart < _RESTART_KEYFRAMES,
         )
 
     def install(

@@ -13,7 +13,7 @@ from vislam.core.geometry import invert, se3_log
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
-from vislam.frontend.attempt import Attempt, weakness
+from vislam.frontend.attempt import DEGRADED_INLIERS, Attempt, weakness
 from vislam.frontend.blind_keyframe import NO_DEPTH, BlindKeyframe
 from vislam.frontend.by_depth import ByDepth, Moved
 from vislam.frontend.intake import Intake
@@ -24,6 +24,7 @@ from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.placing import Placer
 from vislam.frontend.result import CommonErrors, TrackResult, metric_motion, too_few
 from vislam.frontend.second_camera import SecondCamera
+from vislam.frontend.tracker import MIN_START_CORNERS
 from vislam.frontend.view import ImageDepth, View, stereo_views
 from vislam.vision.two_view import epipolar_distances
 
@@ -143,7 +144,7 @@ class MetricFrontEnd:
             return "cam0 sees nothing; cam1 is followed"
         if self._tracks.lacks_depth:
             return "the keyframe has no depth of its own"
-        return weakness(attempt.followed, attempt.inliers, self._config.degraded_inliers, self._config)
+        return weakness(attempt.followed, attempt.inliers, DEGRADED_INLIERS)
 
     def _measurement(self, frame: Frame, keyframe_id: int, attempt: Attempt) -> VoMeasurement:
         covariance = self._placer.covariance(attempt, self._noise.frame_px, frame.tracks is not None)
@@ -225,7 +226,7 @@ class MetricFrontEnd:
     def _lack(self, frame: Frame, has_depth: bool) -> str:
         """Return what a frame lacks to start from, or an empty string; only the very first may be without depth."""
         corners, deep = len(self._tracks), int(self._tracks.landmarks.known.sum())
-        if corners < self._config.min_start_corners:
+        if corners < MIN_START_CORNERS:
             return too_few(frame, corners)
         if deep < self._config.min_inliers and (self._life.keyframe is not None or has_depth):
             return f"only {deep} of {corners} corners have depth"

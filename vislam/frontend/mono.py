@@ -14,12 +14,12 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations
 from vislam.core.quantiles import median
-from vislam.frontend.attempt import MotionPredictor, confirmed, failure, weakness
+from vislam.frontend.attempt import DEGRADED_INLIERS, MotionPredictor, confirmed, failure, weakness
 from vislam.frontend.intake import Intake
-from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
+from vislam.frontend.keyframes import PATIENCE_S, KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.result import CommonErrors, TrackResult, too_few, unscaled_motion
-from vislam.frontend.tracker import Tracker
+from vislam.frontend.tracker import MIN_START_CORNERS, Tracker
 from vislam.vision.refine import refine_pose
 from vislam.vision.two_view import (
     RotationPrior,
@@ -33,6 +33,10 @@ from vislam.vision.two_view import (
     turn_only,
 )
 
+# of rotation by the gyro since a keyframe, beside its bias: scale, time offset
+_MONO_GYRO_SIGMA_RAD = 0.002
+_MONO_MIN_PARALLAX_PX = 3.0  # less, and the direction of motion drowns in noise: only rotation is told
+_MIN_GIVEN = 8  # in place of both numbers for tracks given from elsewhere: few, but somebody chose them
 _RANSAC_PX = 1.5
 _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second solution that a flat scene has
 _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a translation
@@ -76,8 +80,8 @@ class _Limits:
     def of(cls, config: FrontEndConfig, fx: float, is_given: bool) -> _Limits:
         """Return those of a camera; given tracks are as noisy in the keyframe as here, where a corner is its patch."""
         ends = _BOTH_ENDS if is_given else 1.0
-        least = config.min_given if is_given else config.min_inliers
-        return cls(least, ends * config.track_sigma_px / fx, ends * config.mono_min_parallax_px)
+        least = _MIN_GIVEN if is_given else config.min_inliers
+        return cls(least, ends * config.track_sigma_px / fx, ends * _MONO_MIN_PARALLAX_PX)
 
 
 class MonoFrontEnd:
@@ -101,7 +105,7 @@ class MonoFrontEnd:
         self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
         self._noise = PixelNoise(config.track_sigma_px)
-        self._predictor = MotionPredictor(self._T_body_cam, config.patience_s)
+        self._predictor = MotionPredictor(self._T_body_cam, PATIENCE_S)
         self._limits = _Limits.of(config, self._camera.fx, is_given=False)
         self._life = KeyframeLife(config, has_scale=False)
         self._last_px: Array = np.empty((0, 2))  # of every track in the last frame, guessed where it was not found
@@ -175,7 +179,7 @@ class MonoFrontEnd:
         self._gyro_sigma_rad += sigma_rad_s * dt_s
         if not np.isfinite(self._gyro_sigma_rad):
             return None
-        return RotationPrior(self._R_key_gyro, self._config.mono_gyro_sigma_rad + self._gyro_sigma_rad)
+        return RotationPrior(self._R_key_gyro, _MONO_GYRO_SIGMA_RAD + self._gyro_sigma_rad)
 
     def _confirmed(
         self, motion: _Motion, R_guess: Array, prior: RotationPrior | None, T_last_now: Array | None
@@ -204,7 +208,7 @@ class MonoFrontEnd:
                 view = _without_vague_direction(both)
                 parallax_px = self._camera.fx * _parallax(view.R_key_cam, key_xy, xy)
         agree, least = int(view.inliers.sum()), self._limits.min_inliers
-        why = failure(len(self._tracker), followed, agree, view.converged, least, self._config)
+        why = failure(len(self._tracker), followed, agree, view.converged, least)
         return _Motion(view, pixels, xy, parallax_px, why)
 
     def _turn(self, R_guess: Array, key_xy: Array, xy: Array) -> TwoViewEstimate:
@@ -285,8 +289,8 @@ class MonoFrontEnd:
 
     def _weakness(self, motion: _Motion) -> str:
         # of tracks that somebody chose, as many times the least as of our own
-        enough = self._config.degraded_inliers * self._limits.min_inliers // self._config.min_inliers
-        return weakness(motion.followed, motion.inliers, enough, self._config)
+        enough = DEGRADED_INLIERS * self._limits.min_inliers // self._config.min_inliers
+        return weakness(motion.followed, motion.inliers, enough)
 
     def _lose(self, frame: Frame, motion: _Motion) -> TrackResult:
         self._lost = True
@@ -301,7 +305,7 @@ class MonoFrontEnd:
         self._tracker.forget()
         count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         self._last_px = self._tracker.pixels.copy()
-        least = self._config.min_start_corners if frame.tracks is None else self._config.min_given
+        least = MIN_START_CORNERS if frame.tracks is None else _MIN_GIVEN
         if count < least:
             self._tracker.forget()
             self._last_px = np.empty((0, 2))

@@ -15,6 +15,7 @@ from vislam.vision.landmarks import metric_points, move
 from vislam.vision.locate import pnp_ransac, recognise
 from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose
 
+_DEPTH_NOW_FACTOR = 2.0  # on the sigma of depth between keyframes, which is not averaged over time
 # times what tracks scatter by: the noise of independent tracks that would move a pose as much. What neighbours have in
 # common (patch, lens, registered depth) leaves no residual, since a pose can follow it; it is as if 16 of them were one
 _ALIKE = 4.0
@@ -121,7 +122,7 @@ class Placer:
 
     def _failure(self, estimate: PoseEstimate, xy: Array) -> str:
         followed, agree, least = int(np.isfinite(xy[:, 0]).sum()), int(estimate.inliers.sum()), self._config.min_inliers
-        return failure(len(self._tracks), followed, agree, estimate.converged, least, self._config)
+        return failure(len(self._tracks), followed, agree, estimate.converged, least)
 
     def _search(self, T_guess: Array, xy: Array, depth_now: DepthReading | None) -> PoseEstimate:
         """Refine from the prediction; when few tracks agree with the result, look for a better start by RANSAC."""
@@ -148,7 +149,7 @@ class Placer:
     def _weighed(self, depth_now: DepthReading | None) -> tuple[Array | None, Array | None]:
         if depth_now is None:
             return None, None
-        return depth_now.rho, self._config.depth_now_factor * depth_now.sigma_rho
+        return depth_now.rho, _DEPTH_NOW_FACTOR * depth_now.sigma_rho
 
     def _ransac(self, points_m: Array, xy: Array) -> Array | None:
         return pnp_ransac(points_m, xy, _RANSAC_PX / self._tracks.camera.fx, self._config.min_inliers)

@@ -19,6 +19,7 @@ from vislam.config import InitConfig
 from vislam.core.messages import Array, Observations
 from vislam.core.quantiles import median
 
+_STILL_PX = 0.8  # median image motion over 0.5 s, noise taken out: below, the camera may be at rest
 _NS = 1_000_000_000
 _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
 _MAX_INTERVAL_NS = _NS  # tracks that bridge a longer pause say nothing about what was in it
@@ -46,7 +47,7 @@ class Stillness:
 
     def __init__(self, config: InitConfig) -> None:
         """Start empty; `config.still_px` is the limit for motion over the window and from frame to frame."""
-        self._limit_px = config.still_px
+        self._limit_px = _STILL_PX
         self._frames: deque[tuple[int, NDArray[np.int64], Array]] = deque()  # time, ascending ids, pixels
         self.resting = False
         self._places = _Places()  # of frames of this rest that are older than the window

@@ -21,6 +21,8 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array, ImuSpan, Tracking, VoMeasurement
 from vislam.imu.gyro_turns import UNKNOWNS, SeenTurns, integrated, turn_errors
 
+_TIME_OFFSET_SETTLED_S = 0.0005  # sigma at which the estimate is final
+_CLOCK_DRIFT_SIGMA = 0.03  # of that rate: no clock that deserves the name is farther off
 _NS = 1_000_000_000
 _WINDOW_S = 10.0  # of frames that are looked at: longer than a hand takes to turn this way and that
 _SLACK_S = 0.1  # more inertial data than the frames span, so that they can be shifted
@@ -68,7 +70,7 @@ class TimeOffset:
     def __init__(self, config: InitConfig) -> None:
         """Start from the configured offset."""
         self._config = config
-        none, drift_sigma = np.zeros(3), config.clock_drift_sigma if config.clock_drift else _NO_DRIFT
+        none, drift_sigma = np.zeros(3), _CLOCK_DRIFT_SIGMA if config.clock_drift else _NO_DRIFT
         self.estimate = TimeOffsetEstimate(
             config.time_offset_s, config.time_offset_sigma_s, none, none, np.full(3, TURN_SIGMA), 0,
             drift_sigma=drift_sigma,
@@ -163,7 +165,7 @@ class TimeOffset:
             float(x[0]), sigma_s, x[1:4].copy(), x[4:7].copy(), deviations[4:7], used, now_ns, float(x[7]),
             float(deviations[7]),
         )  # fmt: skip
-        self.settled = sigma_s < config.time_offset_settled_s and not config.clock_drift
+        self.settled = sigma_s < _TIME_OFFSET_SETTLED_S and not config.clock_drift
         if config.clock_drift and sigma_s < _KNOWN_S and deviations[7] < _KNOWN_DRIFT:
             # loosely, since the frames of this estimate are among those of the next
             self._prior = replace(self.estimate, sigma_s=config.time_offset_sigma_s, drift_sigma=_KNOWN_DRIFT)

@@ -21,6 +21,15 @@ from vislam.core.messages import Array, Bools, Frame, ImageU8, Observations
 from vislam.vision.brightness import matched
 from vislam.vision.features import FlowSettings, detect_corners, follow
 
+CELL_PX = 48  # side of the grid cells that share the tracks
+MIN_CORNER_RESPONSE = 1.0  # (grey levels / px)^2, smaller eigenvalue; sensor noise gives less
+_FLOW_WINDOW_PX = 16  # Lucas-Kanade window: larger is robuster to blur, smaller to parallax, and cheaper
+_FLOW_LEVELS = 3  # pyramid levels above the image: reach of about 80 px around the predicted place
+MIN_START_CORNERS = 40  # an image with fewer cannot start a keyframe
+# forward-backward disagreement of a good match; 0.7 drops blurred ones that still help
+MAX_BACK_PX = 1.5
+
+
 FindCorners = Callable[[ImageU8, Array], Array]
 """Finds new corners: grey image [H, W], pixels [M, 2] of those that are followed -> pixels [N, 2]."""
 
@@ -32,9 +41,7 @@ class Tracker:
         """Start without tracks; `find` looks for corners instead of a grid over the whole image."""
         self._config = config
         self._find = find
-        self._flow = FlowSettings(
-            window_px=config.flow_window_px, levels=config.flow_levels, max_back_px=config.max_back_px
-        )
+        self._flow = FlowSettings(window_px=_FLOW_WINDOW_PX, levels=_FLOW_LEVELS, max_back_px=MAX_BACK_PX)
         self._image: ImageU8 | None = None
         self.next_id = 0
         self.ids: NDArray[np.int64] = np.empty(0, dtype=np.int64)
@@ -119,8 +126,8 @@ class Tracker:
             fresh = self._find(image, self.pixels)
         else:
             fresh = detect_corners(
-                image, config.max_tracks - len(self.ids), config.cell_px, config.min_distance_px, self.pixels,
-                config.min_corner_response,
+                image, config.max_tracks - len(self.ids), CELL_PX, config.min_distance_px, self.pixels,
+                MIN_CORNER_RESPONSE,
             )  # fmt: skip
         ids = np.arange(self.next_id, self.next_id + len(fresh), dtype=np.int64)
         self.next_id += len(fresh)

@@ -13,11 +13,17 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert
 from vislam.core.jit import njit
 from vislam.core.messages import Array, Frame, ImageF32, ImageU8, Observations
-from vislam.frontend.tracker import given_rows
+from vislam.frontend.tracker import CELL_PX, MAX_BACK_PX, MIN_CORNER_RESPONSE, MIN_START_CORNERS, given_rows
 from vislam.vision.brightness import matched
 from vislam.vision.features import FlowSettings, detect_corners, follow
 from vislam.vision.landmarks import move
 
+# of the spread of 1/z within 8x8 px: what a wrong registration by some pixels costs
+_DEPTH_SPREAD = 0.5
+_DEPTH_EDGE_RHO = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
+_STEREO_WINDOW_PX = 15  # smaller than in time: depth edges hurt, blur is the same in both images
+_STEREO_LEVELS = 3  # pyramid levels above the image
+EPIPOLAR_GATE_PX = 1.5  # distance from the epipolar line that calibration and noise explain
 _REACH_PX = 4  # half the side of the neighbourhood that says how much a wrong registration would matter
 _START_DISPARITIES = (8.0, 25.0, 60.0)  # px; with the reach of Lucas-Kanade they cover 0 to about 90
 
@@ -107,8 +113,8 @@ class ImageDepth:
         if frame.depth_m is None:
             unknown: Array = np.full(len(pixels), np.nan)
             return DepthReading(unknown, np.full(len(pixels), config.depth_sigma_rho))
-        rho, spread = _sample(frame.depth_m, pixels, config.min_depth_m, config.max_depth_m, config.depth_edge_rho)
-        return DepthReading(rho, np.hypot(config.depth_sigma_rho, config.depth_spread * spread))
+        rho, spread = _sample(frame.depth_m, pixels, config.min_depth_m, config.max_depth_m, _DEPTH_EDGE_RHO)
+        return DepthReading(rho, np.hypot(config.depth_sigma_rho, _DEPTH_SPREAD * spread))
 
 
 @njit(cache=True, nogil=True)
@@ -152,9 +158,7 @@ class StereoDepth:
         self._right = rig.cameras[1]
         self._T_right_left = invert(rig.T_cam0_cam1)
         self._config = config
-        self._flow = FlowSettings(
-            window_px=config.stereo_window_px, levels=config.stereo_levels, max_back_px=config.max_back_px
-        )
+        self._flow = FlowSettings(window_px=_STEREO_WINDOW_PX, levels=_STEREO_LEVELS, max_back_px=MAX_BACK_PX)
         baseline_m = float(np.linalg.norm(self._T_right_left[:3, 3]))
         self._sigma_rho = config.stereo_sigma_px / (self._right.fx * baseline_m)
         self._max_rho = 1.0 / config.min_depth_m
@@ -201,7 +205,7 @@ class StereoDepth:
         rho, off_line = _triangulate(rays, self._T_right_left[:3, 3].copy(), self._right.normalise(right_px))
         with np.errstate(invalid="ignore"):
             # a point at infinity may measure slightly negative; beyond that the match is wrong
-            good = (off_line * self._right.fx <= self._config.epipolar_gate_px) & (rho <= self._max_rho)
+            good = (off_line * self._right.fx <= EPIPOLAR_GATE_PX) & (rho <= self._max_rho)
             good &= rho > -3.0 * self._sigma_rho
         return np.where(good, np.maximum(rho, 0.0), np.nan)
 
@@ -284,8 +288,6 @@ def spread(covariances: Array) -> Array:
 
 def sees(image: ImageU8, config: FrontEndConfig) -> bool:
     """Return whether an image shows enough to start from: a covered camera's does not."""
-    wanted = config.min_start_corners
-    corners = detect_corners(
-        image, wanted, config.cell_px, config.min_distance_px, np.empty((0, 2)), config.min_corner_response
-    )
+    wanted = MIN_START_CORNERS
+    corners = detect_corners(image, wanted, CELL_PX, config.min_distance_px, np.empty((0, 2)), MIN_CORNER_RESPONSE)
     return len(corners) >= wanted

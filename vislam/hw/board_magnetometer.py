@@ -11,7 +11,7 @@ from vislam.hw.affine import Affine
 from vislam.hw.chips import BusError, Hmc5883l, I2cBus, Magnetometer, SettingsLostError
 from vislam.hw.field_watch import FieldWatch
 from vislam.hw.health import Health
-from vislam.hw.link import ChipLinks, Link
+from vislam.hw.link import STUCK_SAMPLES, ChipLinks, Link
 from vislam.hw.timing import Clock
 
 _NS = 1_000_000_000
@@ -35,7 +35,7 @@ class BoardMagnetometer:
         """Take the board's settings and clock, and how such chips are found on a bus for a range in gauss."""
         c = config.calibration
         self._config, self._clock, self._find = config, clock, find
-        self._watch = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), config.stuck_samples)
+        self._watch = FieldWatch(Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, 1.0), STUCK_SAMPLES)
         self._next_ns = 0
         self.chip: Magnetometer | None = None
         self.link = Link(self.start, Health.MAG_FAULT, is_inertial=False, is_wanted=is_wanted)

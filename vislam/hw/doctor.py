@@ -31,6 +31,7 @@ from vislam.hw.library_cameras import (
     open_with_imu,
     reads_own_imu,
 )
+from vislam.hw.link import BUS_TIMEOUT_S
 from vislam.hw.sensors import open_inertial
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.hw.timing import Clock, HostClock
@@ -155,7 +156,7 @@ def _examine_buses(
     severity: Severity = "warning" if wanted is None else "error"
     for path in paths:
         try:
-            with closing(I2cBus(path, sensors.gy85.bus_timeout_s)) as bus:
+            with closing(I2cBus(path, BUS_TIMEOUT_S)) as bus:
                 make = _examine_chips(notes, bus, clock, root, severity, sensors)
         except HardwareError as error:
             notes.failed(error, path, severity)

@@ -15,6 +15,7 @@ from vislam.hw.chips.fifo_imu import SATURATED_LSB, RawSamples
 from vislam.hw.fifo_stamps import FifoStamps
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
+from vislam.hw.link import STUCK_SAMPLES
 
 
 @dataclass(slots=True)
@@ -92,7 +93,7 @@ class FifoSamples:
         `asked_ns` and `answered_ns` are around the question how many there are.
         """
         events = self._gyro.looked(raw.gyro, tallies) | self._accel.looked(raw.accel, tallies)
-        stuck = [watch.name for watch in (self._gyro, self._accel) if watch.repeats >= self._config.stuck_samples]
+        stuck = [watch.name for watch in (self._gyro, self._accel) if watch.repeats >= STUCK_SAMPLES]
         for name in stuck:
             tallies[f"{name}_stuck"] += 1
         drift = self.zero.drift_rad_s(self.temperature_c)

@@ -25,7 +25,7 @@ from vislam.hw.chips import (
 )
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.link import START_ATTEMPTS, ChipLinks, Link, refuse_shared
+from vislam.hw.link import START_ATTEMPTS, STUCK_SAMPLES, ChipLinks, Link, refuse_shared
 from vislam.hw.timing import Clock, HostClock, read_in_rounds
 from vislam.hw.track import SampleTrack
 
@@ -197,7 +197,7 @@ class Gy85:
         is_repeated = tuple(counts) == self._last_counts
         link.repeats = link.repeats + 1 if is_repeated else 0
         self._last_counts = (counts[0], counts[1], counts[2])
-        if link.repeats >= self._config.stuck_samples:
+        if link.repeats >= STUCK_SAMPLES:
             self._links.counts["gyro_stuck"] += 1
             link.drop(asked)
             return
@@ -245,7 +245,7 @@ class Gy85:
         for row in counts:
             link.repeats = link.repeats + 1 if (row == self._last_accel).all() else 0
             self._last_accel = row
-        if link.repeats >= self._config.stuck_samples:
+        if link.repeats >= STUCK_SAMPLES:
             self._links.counts["accel_stuck"] += 1
             link.drop(asked)
 

@@ -12,6 +12,9 @@ from vislam.hw.chips import BusError, I2cBus, SelfTest, SettingsLostError, kerne
 from vislam.hw.health import Health
 from vislam.hw.timing import Clock
 
+_NACKS_TO_REOPEN = 5  # in a row until a chip counts as gone: single ones are noise on the wire
+BUS_TIMEOUT_S = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
+STUCK_SAMPLES = 100  # equal to the last bit in a row: noise makes this impossible, a hung chip does it
 START_ATTEMPTS = 3  # a wire may be disturbed just then
 
 
@@ -115,7 +118,7 @@ class ChipLinks:
                 return None
             self._retry_bus_ns = now + reopen_ns
             try:
-                self._bus = I2cBus(self._config.bus, self._config.bus_timeout_s, self.counts)
+                self._bus = I2cBus(self._config.bus, BUS_TIMEOUT_S, self.counts)
             except BusError as error:
                 return error
         problem: HardwareError | None = None
@@ -144,7 +147,7 @@ class ChipLinks:
             return
         self.events |= Health.BUS_FAULT
         link.nacks += 1
-        if error.kind != "nack" or link.nacks >= self._config.nacks_to_reopen:
+        if error.kind != "nack" or link.nacks >= _NACKS_TO_REOPEN:
             link.drop(now)
         if error.kind == "gone":
             for other in self._links:

@@ -19,6 +19,7 @@ from vislam.hw.library_cameras import (
     open_image_camera,
     reads_own_imu,
 )
+from vislam.hw.link import BUS_TIMEOUT_S
 
 if TYPE_CHECKING:
     import socket
@@ -132,7 +133,7 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
         from vislam.hw.chips import I2cBus
 
         board = config.gy85 if kind == "gy85" else config.board
-        I2cBus(where or board.bus, board.bus_timeout_s).close()
+        I2cBus(where or board.bus, BUS_TIMEOUT_S).close()
     elif kind in ("bno085", "adafruit"):
         from vislam.hw.adafruit import BNO085, check_driver
 

@@ -11,6 +11,10 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import AS_MODELLED, Array, ImuSpan, NoiseScale
 from vislam.imu.series import join
 
+_REST_GYRO_STD_RAD_S = 0.03  # idling EuRoC drone 0.007 to 0.03, hovering above 0.065 (0.5 s windows)
+# idling motors shake up to 0.35; the gyro and the image decide between the two
+_REST_ACCEL_STD_M_S2 = 0.4
+_REST_GYRO_MAX_RAD_S = 0.7  # mean rate: only the boot bias of a cheap gyro (ITG3205: 40 deg/s) may show
 _NS = 1_000_000_000
 _NOISE_SIGMAS = 3.0  # a sensor noisier than the thresholds assume must still be able to rest
 _SET_OFF_M_S = 0.02  # gained since the force was that of rest: a filter takes rest's speed for zero to 5 mm/s
@@ -23,12 +27,12 @@ def is_still(gyro_rad_s: Array, accel_m_s2: Array, most: tuple[float, float, flo
     return all(float(np.linalg.norm(value)) < limit for value, limit in zip(found, most, strict=True))
 
 
-def still_limits(config: InitConfig, noise: ImuNoise, scale: NoiseScale = AS_MODELLED) -> tuple[float, float, float]:
+def still_limits(noise: ImuNoise, scale: NoiseScale = AS_MODELLED) -> tuple[float, float, float]:
     """Return the `most` of `is_still`, widened where the sensor's own white noise needs it."""
     per_sample = np.sqrt(3.0 * noise.rate_hz) * _NOISE_SIGMAS
-    gyro = max(config.rest_gyro_std_rad_s, per_sample * noise.gyroscope_noise_density * scale.gyro)
-    accel = max(config.rest_accel_std_m_s2, per_sample * noise.accelerometer_noise_density * scale.accel)
-    return gyro, accel, config.rest_gyro_max_rad_s
+    gyro = max(_REST_GYRO_STD_RAD_S, per_sample * noise.gyroscope_noise_density * scale.gyro)
+    accel = max(_REST_ACCEL_STD_M_S2, per_sample * noise.accelerometer_noise_density * scale.accel)
+    return gyro, accel, _REST_GYRO_MAX_RAD_S
 
 
 class RestDetector:
@@ -97,4 +101,4 @@ class RestDetector:
 
     def _is_still(self, span: ImuSpan) -> bool:
         """Return whether one span looks like rest, whatever its length."""
-        return is_still(span.gyro_rad_s, span.accel_m_s2, still_limits(self._config, self._noise, span.noise))
+        return is_still(span.gyro_rad_s, span.accel_m_s2, still_limits(self._noise, span.noise))

@@ -13,6 +13,8 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import Array, ImuSample, ImuSpan, NavState
 from vislam.imu.rest import is_still, still_limits
 
+_LEVEL_ACCEL_SIGMA_M_S2 = 1.5  # of a body that may move: a hand or a drone; 9 deg of tilt
+_LEVEL_SPEED_SIGMA_M_S = 2.0  # of the same
 _NS = 1_000_000_000
 _CHOSEN = 1e-3  # sigma, rad and m, of heading and position where odom is defined to be zero
 _REST_SIGMA_M_S = 0.02  # a body at rest still sways
@@ -39,7 +41,7 @@ def state_at_rest(
         np.array([sample.accel_m_s2 for sample in samples]),
     )
     gyro, force = span.gyro_rad_s.mean(axis=0), span.accel_m_s2.mean(axis=0)
-    if not is_still(span.gyro_rad_s, span.accel_m_s2, still_limits(config, noise)):
+    if not is_still(span.gyro_rad_s, span.accel_m_s2, still_limits(noise)):
         raise DataError(
             f"the {length_s:.2f} s of samples are not of rest: rate {np.linalg.norm(gyro):.2g} rad/s, its spread "
             f"{np.linalg.norm(span.gyro_rad_s.std(axis=0)):.2g} rad/s, that of the force "
@@ -97,11 +99,11 @@ def level_covariance(force_error_m_s2: float, R: Array, gravity_m_s2: float, con
 
     `force_error_m_s2` is by how much the norm of the force differs from gravity: so much acceleration is certain.
     """
-    acceleration = max(config.level_accel_sigma_m_s2, abs(force_error_m_s2))
+    acceleration = max(_LEVEL_ACCEL_SIGMA_M_S2, abs(force_error_m_s2))
     tilt = float(np.hypot(acceleration, config.accel_bias_sigma_m_s2)) / gravity_m_s2
     covariance = np.zeros((15, 15))
     heading = np.outer(R[2], R[2])  # about the vertical, on the body side
     covariance[:3, :3] = tilt**2 * (np.eye(3) - heading) + _CHOSEN**2 * heading
-    sigmas = _CHOSEN, config.level_speed_sigma_m_s, config.gyro_bias_sigma_rad_s, config.accel_bias_sigma_m_s2
+    sigmas = _CHOSEN, _LEVEL_SPEED_SIGMA_M_S, config.gyro_bias_sigma_rad_s, config.accel_bias_sigma_m_s2
     covariance[3:, 3:] = np.diag(np.repeat(np.square(sigmas), 3))
     return covariance

@@ -18,6 +18,7 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array, GraphUpdate, Keyframe, KeyframePacket, LoopEdge, Submaps
+from vislam.frontend.by_depth import DEPTH_APART_S
 from vislam.loop import Candidate, Verification
 from vislam.mapping.depth.localise import DepthAnswer, Guess
 from vislam.mapping.depth.stored import stored_depth
@@ -58,7 +59,7 @@ class DepthInMap:
         self._T_map_odom_told: Array | None = None
         self._way_m, self._T_odom_before = 0.0, np.eye(4)
         self._since_s, self._t_ns_before = 0.0, 0  # from the keyframe before to the newest
-        self._depth_apart_s = config.frontend.depth_apart_s
+        self._depth_apart_s = DEPTH_APART_S
         self._T_body_cam = rig.T_body_cams[0]
         self._last: _Last | None = None
         self.counters = {"asked": 0, "refused": 0, "alone": 0, "offered": 0}

@@ -41,6 +41,8 @@ from vislam.sensors import Suite
 from vislam.trajectory.continuity import in_odom
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
+_MAX_WAIT_S = 0.5  # a frame waits so long for the inertial sample after it, then goes on without
+
 
 class Front:
     """Tracks frames, corrects the filter with them and hands over keyframes; `process` is the order of it.
@@ -142,7 +144,7 @@ class Front:
         newest = self._imu.buffer.newest_t_ns
         waited_s = (newest_frame_t_ns - frame_t_ns) * 1e-9
         offset_ns = self.camera_clock.offset_ns(frame_t_ns)
-        most_s = self.config.imu.max_wait_s + max(offset_ns, 0) * 1e-9
+        most_s = _MAX_WAIT_S + max(offset_ns, 0) * 1e-9
         return (newest is not None and newest > frame_t_ns + offset_ns) or waited_s > most_s
 
     def process(self, frame: Frame) -> FrontStep:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _PIECE_S = 0.2  # over which force is averaged: noise and vibration show no scale
 _PIECES = 20  # 4 s, the longest that the search for a first scale looks at, too
+# a run whose quietest second has less than a third of the white noise given is warned
+_NOISE_TOLERANCE = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +178,7 @@ def report_of(front: Front) -> FrontReport:
     if begun.phase is Phase.VISION_ALONE or floor is None:
         return report
     return replace(
-        report, nis=imu.filtering.ekf.nis_statistics, noise_warnings=floor.warnings(front.config.imu.noise_tolerance),
+        report, nis=imu.filtering.ekf.nis_statistics, noise_warnings=floor.warnings(_NOISE_TOLERANCE),
         imu_noise=floor.summary(), noise_ratios=floor.ratios,
     )  # fmt: skip
 

@@ -22,6 +22,7 @@ from vislam.pipeline.inertial_stages import Inertial
 from vislam.trajectory import Trajectory
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe, WaitingKeyframes, first_keyframe_state
 
+_LEVEL_S = 0.1  # with metric vision: samples before the first frame that say at once what is level
 _OTHER_WAYS = "a start from rest, a second camera or depth needs less"
 
 
@@ -263,7 +264,7 @@ class GravityWait:
         if not vo.has_scale or vo.T_keyframe_body is None or self._filtering.coupling != "loose":
             return None
         if span is None and self._buffer.oldest_t_ns is not None:
-            oldest_ns = vo.t_ns - round(self._config.init.level_s * 1e9)
+            oldest_ns = vo.t_ns - round(_LEVEL_S * 1e9)
             span = self._buffer.unbroken(max(oldest_ns, self._buffer.oldest_t_ns), vo.t_ns)
         if span is None:
             return None

@@ -29,7 +29,7 @@ from vislam.runs.session import Session, SessionWriter, has_begun, recall
 _FARTHEST_M = 1e5  # of a pose that a user gives
 # settings (map.*) that decide what a keyframe's cloud is; what is made of clouds may be set otherwise in every run
 _SHAPING = (
-    "min_range_m", "max_range_m", "pixel_step", "edge_ratio", "edge_px", "speckle_pixels", "stereo_scale",
+    "min_range_m", "max_range_m", "pixel_step", "edge_px", "speckle_pixels", "stereo_scale",
     "stereo_disparity_sigma_px", "stereo_max_range_m", "stereo_max_sigma_m", "mono_depth",
 )  # fmt: skip
 

@@ -39,6 +39,7 @@ from vislam.ekf.tight.tracks import FrameTracks, image_motion_px, marked, ripe_t
 if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
 
+_CLONES = 11  # past poses that tracks tie together; half a second at 20 Hz
 _MOST_POINTS = 25  # long tracks kept as points of the state; they stop the drift while little moves
 _POINT_DEPTH_RATIO = 0.1  # sigma of its distance over it that such a point may have at first
 _POINT_MISSES = 1  # frames in a row that may not see such a point before it is dropped
@@ -107,7 +108,7 @@ class FrameUpdater:
         )
         # one metric observation and another fix a point and leave something over
         self._least = 2 if rig.is_stereo or rig.has_depth else _MIN_OBSERVATIONS
-        most = features.ROWS_MAX * (config.tight_clones + 2)
+        most = features.ROWS_MAX * (_CLONES + 2)
         self._limits = np.array([chi_square_limit(config.gate_probability, max(k, 1)) for k in range(most)])
         self._reset_sigmas = reset_sigmas()
 
@@ -154,7 +155,7 @@ class FrameUpdater:
     def _leaving(self, window: Window) -> int | None:
         """Return which clone goes: the oldest, unless the last but one is where the one before it was."""
         count = len(window.frames)
-        if count <= self._config.tight_clones:
+        if count <= _CLONES:
             return None
         kept, candidate = window.frames[-3], window.frames[-2]
         still = image_motion_px(kept, candidate) < _STILL_PX

@@ -20,6 +20,7 @@ from vislam.core.messages import Array, ImageU8, ImuSpan
 from vislam.frontend.attempt import gyro_rotation
 from vislam.vision.features import detect_corners, detect_harris, noise_grey
 
+_TEXTURE_RATIO = 4.0  # of a corner's response to that of image noise alone; below, it is noise
 _FLOOR_ROWS, _COLUMNS = 2, 4  # regions of the floor; above the horizon there is one row
 _HORIZON_PX = 8  # kept clear on both sides of the horizon
 _STEEPEST_DEG = 80.0  # of a camera that still looks ahead
@@ -196,7 +197,7 @@ class Regions:
     ) -> Array:
         """Find corners over the whole image whose response stands out from the image's own noise."""
         noise = min(noise_grey(image), _MAX_NOISE_GREY)
-        least = max(least, self._config.texture_ratio * _NOISE_RESPONSE * noise * noise)
+        least = max(least, _TEXTURE_RATIO * _NOISE_RESPONSE * noise * noise)
         return detect_corners(image, count, cell_px, distance_px, live, least)
 
     def harris(self, image: ImageU8, live: Array, distance_px: float) -> Array:

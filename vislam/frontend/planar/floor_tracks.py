@@ -11,11 +11,13 @@ from vislam.core.camera import Camera
 from vislam.core.messages import Array, Bools, Frame, ImageU8, Observations
 from vislam.frontend.planar.fit import FloorPair
 from vislam.frontend.planar.floor import Regions
-from vislam.frontend.tracker import Tracker
+from vislam.frontend.tracker import CELL_PX, MIN_CORNER_RESPONSE, Tracker
 from vislam.vision.brightness import matched
 from vislam.vision.features import FlowSettings, follow
 from vislam.vision.landmarks import UNKNOWN_RHO, Landmarks
 
+# of floor points: a pixel is worth d^2 / H; at 8, patches come out 0.2 % short
+_MAX_DISTANCE_HEIGHTS = 5.0
 _GUESSED_RHO_SIGMA = 0.15  # 1/m, of a corner under the horizon, which is on the floor or on what stands there
 _NEAR_PX = 12.0  # of a track, within which a feature lies on the same surface
 _TELLING_PX = 3.0  # of image motion; less, and anything fits
@@ -38,7 +40,7 @@ class FloorTracks:
         self._height_m = height_m
         self._is_split = config.planar.method == "split"
         self.px = 2.0 / (camera.fx + camera.fy)
-        self.max_distance_m = config.planar.max_distance_heights * height_m
+        self.max_distance_m = _MAX_DISTANCE_HEIGHTS * height_m
         self.tracker = Tracker(replace(config, max_tracks=config.planar.max_tracks), self._find)
         self.landmarks = Landmarks()
         self._off_floor: Bools = np.zeros(0, dtype=np.bool_)  # that are seen not to lie on the floor
@@ -138,9 +140,7 @@ class FloorTracks:
         if self._is_split:
             return self._regions.harris(image, live, config.min_distance_px)
         wanted = self._planar.max_tracks - len(live)
-        return self._regions.shi_tomasi(
-            image, live, wanted, config.cell_px, config.min_distance_px, config.min_corner_response
-        )
+        return self._regions.shi_tomasi(image, live, wanted, CELL_PX, config.min_distance_px, MIN_CORNER_RESPONSE)
 
     def _add_landmarks(self, count: int, R_level_cam: Array) -> None:
         """Give the tracker's last `count` corners landmarks: under the horizon on the floor, as a guess."""

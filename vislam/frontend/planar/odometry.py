@@ -21,16 +21,28 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import Learned
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
 from vislam.frontend.intake import Intake
-from vislam.frontend.keyframes import Exposed, KeyframeLife, keyframe_reason
+from vislam.frontend.keyframes import PATIENCE_S, Exposed, KeyframeLife, keyframe_reason
 from vislam.frontend.planar.course import Course
 from vislam.frontend.planar.fit import Fit, FloorPair, camera_motion, joint_fit, no_fit, split_fit
 from vislam.frontend.planar.floor import Mount, Regions, Tilt, make_mount
 from vislam.frontend.planar.floor_tracks import FloorTracks, Steps
-from vislam.frontend.planar.place import Place, by_jitter, by_tilt, failure, weakness, yaw_prior
+from vislam.frontend.planar.place import (
+    MIN_CELLS,
+    MIN_POINTS,
+    STAMP_JITTER_S,
+    Place,
+    by_jitter,
+    by_tilt,
+    failure,
+    weakness,
+    yaw_prior,
+)
 from vislam.frontend.result import CommonErrors, TrackResult, metric_motion, too_few
+from vislam.frontend.tracker import MAX_BACK_PX, MIN_START_CORNERS
 from vislam.vision.landmarks import move
 from vislam.vision.two_view import from_epipolar_segment
 
+_HISTORY_FRAMES = 8  # method split: a base frame is at most so old
 _EPIPOLAR_PX = 3.0  # of a track off the floor that agrees with the motion
 _FEW = 6  # points in a region, method split: below, it has run dry
 
@@ -52,8 +64,8 @@ class PlanarFrontEnd:
         self._tilt = Tilt(self._planar, mount)
         self._regions = Regions(self._planar, self._camera, mount)
         self._tracks = FloorTracks(config, self._camera, self._regions, mount.height_m)
-        self._course = Course(config.patience_s)
-        self._steps = Steps(config.max_back_px)  # method split
+        self._course = Course(PATIENCE_S)
+        self._steps = Steps(MAX_BACK_PX)  # method split
         self._is_split = self._planar.method == "split"
         self._intake = Intake(rig, seed)
         self._seed = seed
@@ -150,7 +162,7 @@ class PlanarFrontEnd:
 
     def _joint(self, pair: FloorPair, use: Bools, guess: Array, frame: Frame) -> Fit:
         """Fit from the motion that most points agree on; the gyroscope's yaw counts as far as it is known."""
-        if np.count_nonzero(use) < self._planar.min_points:
+        if np.count_nonzero(use) < MIN_POINTS:
             reason = f"only {np.count_nonzero(use)} points on the floor found"
             return no_fit(guess, len(use), reason)
         course, planar = self._course, self._planar
@@ -175,12 +187,12 @@ class PlanarFrontEnd:
         good, weak = fit.inliers.copy(), ""
         if not why_not:
             covariance = covariance + by_tilt(fit, T, self._tilt.covariance, self._planar)
-            covariance += by_jitter(self._course.rate, pair.R_now, self._planar.stamp_jitter_s)
+            covariance += by_jitter(self._course.rate, pair.R_now, STAMP_JITTER_S)
             off_px = from_epipolar_segment(T, pair.rays, xy, 1.0 / self._config.min_depth_m) / pair.px
             with np.errstate(invalid="ignore"):
                 good |= off_px < _EPIPOLAR_PX
             cells = int(np.count_nonzero(self._regions.counts(pixels[fit.inliers])))
-            weak = weakness(fit, candidates, cells, self._config)
+            weak = weakness(fit, candidates, cells)
         return Place(T, covariance, fit, pixels, xy, candidates, good, why_not, weak)
 
     def _frame_seed(self, frame: Frame) -> int:
@@ -210,10 +222,10 @@ class PlanarFrontEnd:
 
     def _ran_dry(self, place: Place) -> str:
         """Return why method split needs new corners, or an empty string."""
-        if self._frames_since_keyframe >= self._planar.history_frames:
+        if self._frames_since_keyframe >= _HISTORY_FRAMES:
             return f"{self._frames_since_keyframe} frames since the last base"
         found = place.pixels[place.good]
-        if np.count_nonzero(self._regions.counts(found) < _FEW) > len(self._regions.floor) - self._planar.min_cells:
+        if np.count_nonzero(self._regions.counts(found) < _FEW) > len(self._regions.floor) - MIN_CELLS:
             return "regions of the floor have run dry"
         if np.count_nonzero(self._regions.counts_above(found) < _FEW) > len(self._regions.above) // 2:
             return "regions above the horizon have run dry"
@@ -247,11 +259,11 @@ class PlanarFrontEnd:
         """Return what a frame lacks to start from, or an empty string."""
         if not frame.images:
             return "planar odometry needs images"
-        if len(self._tracks) < self._config.min_start_corners:
+        if len(self._tracks) < MIN_START_CORNERS:
             return too_few(frame, len(self._tracks))
         floor = self._tracks.on_floor(self._tilt.R_level_cam)
         cells = int(np.count_nonzero(self._regions.counts(self._tracks.pixels[floor])))
-        if np.count_nonzero(floor) < self._planar.min_points or cells < self._planar.min_cells:
+        if np.count_nonzero(floor) < MIN_POINTS or cells < MIN_CELLS:
             return f"too little texture on the floor: {np.count_nonzero(floor)} corners in {cells} of 8 parts of it"
         return ""
 

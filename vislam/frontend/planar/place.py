@@ -6,11 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.config import FrontEndConfig, PlanarConfig
+from vislam.config import PlanarConfig
 from vislam.core.messages import Array, Bools
+from vislam.frontend.attempt import DEGRADED_INLIER_RATIO, DEGRADED_INLIERS
 from vislam.frontend.planar.course import Course
 from vislam.frontend.planar.fit import Fit, scale_sigma
 
+STAMP_JITTER_S = 0.002  # of frames, by a webcam over USB; in a turn 1 ms is 0.05 deg
+_CORRELATION_M = 10.0  # way over which an error of height or tilt adds up: the size of a room
+MIN_POINTS = 20  # of the floor that agree on a motion; fewer: lost
+MIN_CELLS = 4  # of 8 parts of the floor in which they lie
+_YAW_GATE_DEG = 0.3  # and by at least as much
 _LENS_YAW_RAD = 0.001  # of a yaw between keyframe and frame by the gyroscope: scale, axes, time
 _GYRO_KNOWN_ALREADY = 3.0  # on its sigma, since filter and graph use the same gyroscope
 _DEGRADED_VARIANCE = 25.0  # of residuals over what is expected: five times as noisy as a sharp floor
@@ -59,7 +65,7 @@ def by_tilt(fit: Fit, T_key_cam: Array, tilt_covariance: Array, config: PlanarCo
         relative = float(_SCALE_BY_TILT * np.sqrt(tilt_covariance[1, 1]))
     else:
         relative = scale_sigma(fit, tilt_covariance)
-    out[3:, 3:] = relative**2 * max(length, config.correlation_m) / length * np.outer(way, way)
+    out[3:, 3:] = relative**2 * max(length, _CORRELATION_M) / length * np.outer(way, way)
     return out
 
 
@@ -75,31 +81,31 @@ def failure(fit: Fit, candidates: int, course: Course, config: PlanarConfig) -> 
     if fit.failure:
         return fit.failure
     agree, is_split = int(np.count_nonzero(fit.inliers)), config.method == "split"
-    if agree < config.min_points and not is_split:
+    if agree < MIN_POINTS and not is_split:
         return f"only {agree} of {candidates} points on the floor agree on a motion"
     if agree < _UNEXPLAINED_RATIO * candidates:
         return f"only {agree} of {candidates} points that should be on the floor agree on a motion"
     if is_split or not course.knows_yaw:
         return ""
     # the prior pulls: what is left of a contradiction is the smaller, the weaker the floor is
-    jitter_rad = np.sqrt(2.0) * config.stamp_jitter_s * course.rate[0]  # of the stamps at both ends
+    jitter_rad = np.sqrt(2.0) * STAMP_JITTER_S * course.rate[0]  # of the stamps at both ends
     gyro_rad = _LENS_YAW_RAD + course.yaw_sigma_rad
     sigma_rad = float(np.sqrt(fit.covariance[0, 0] + gyro_rad**2 + jitter_rad**2))
-    limit = max(config.yaw_gate_sigmas * sigma_rad, np.deg2rad(config.yaw_gate_deg))
+    limit = max(config.yaw_gate_sigmas * sigma_rad, np.deg2rad(_YAW_GATE_DEG))
     off = abs(float(fit.motion[0]) - course.yaw_rad)
     if off > limit:
         return f"the floor turned by {np.rad2deg(off):.2f} deg more or less than the gyroscope says"
     return ""
 
 
-def weakness(fit: Fit, candidates: int, cells: int, config: FrontEndConfig) -> str:
+def weakness(fit: Fit, candidates: int, cells: int) -> str:
     """Return why the tracking is degraded, or an empty string; `cells` of the floor hold points that agree."""
     agree = int(np.count_nonzero(fit.inliers))
-    if cells < config.planar.min_cells:
+    if cells < MIN_CELLS:
         return f"points on the floor in only {cells} of 8 parts of the image"
-    if agree < config.degraded_inliers:
+    if agree < DEGRADED_INLIERS:
         return f"only {agree} points on the floor agree"
-    if agree < config.degraded_inlier_ratio * candidates:
+    if agree < DEGRADED_INLIER_RATIO * candidates:
         return f"only {agree} of {candidates} points that should be on the floor agree"
     if fit.variance > _DEGRADED_VARIANCE:
         return f"points on the floor are {np.sqrt(fit.variance):.0f} times as noisy as expected"

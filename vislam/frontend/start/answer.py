@@ -12,6 +12,7 @@ from vislam.core.messages import Array, ImuSpan, NavState
 from vislam.frontend.start.solution import Solution
 from vislam.imu.resting import level_covariance
 
+WINDOW_S = 2.0  # metric visual odometry: gravity to 0.03 deg plus what the accelerometer bias hides
 _NS = 1_000_000_000
 
 

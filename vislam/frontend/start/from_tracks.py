@@ -28,6 +28,9 @@ from vislam.frontend.start.solution import Solution, from_bundle
 from vislam.frontend.start.views import Entry, gather_tracks
 from vislam.window.bundle import BundleSolution
 
+_SETTLED_SCALE_SIGMA = 0.03  # of a start that is final, unless the window has reached its length before
+_MAX_POINTS = 60  # monocular: points solved for; more cost time and hardly sharpen scale
+_MIN_PARALLAX_PX = 12.0  # monocular: median over the points; below, depth and so scale drown in noise
 _NS = 1_000_000_000
 _AMPLE = 3.0  # times the least excitation or parallax; more of it is no longer what a start lacks
 _FOREIGN_OFFSET_S = 0.002  # a time offset found in the window that is larger than this is applied before the start
@@ -74,9 +77,9 @@ class StartFromTracks:
         Raises:
             numpy.linalg.LinAlgError: the motion does not determine it.
         """
-        config, fx = self._config, self._camera.fx
+        fx = self._camera.fx
         chosen, window = sighted.chosen, sighted.window
-        every = gather_tracks(chosen, self._camera, self._T_body_cam, self._track_sigma_px, config.max_points)
+        every = gather_tracks(chosen, self._camera, self._T_body_cam, self._track_sigma_px, _MAX_POINTS)
         path = inertial_path(window)
         sigma_xy, good = epipolar_noise(every, path.rotations)
         tracks = replace(every, sigma_xy=min(sigma_xy, MOST_NOISE * every.sigma_xy)).only(good)
@@ -148,7 +151,7 @@ class StartFromTracks:
                 takes_back=True,
                 reason=f"{found.reason}; the start before was taken back: {contradiction}",
             )
-        if found.scale_sigma > config.settled_scale_sigma and seen_s < 0.95 * config.mono_window_s:
+        if found.scale_sigma > _SETTLED_SCALE_SIGMA and seen_s < 0.95 * config.mono_window_s:
             reason = f"scale sigma {100.0 * found.scale_sigma:.1f} % while the window grows"
             return self._refusals.refuse("test", reason)
         return found
@@ -184,7 +187,7 @@ class StartFromTracks:
         if path.excitation_m_s2 < _AMPLE * config.min_excitation_m_s2:
             return f"acceleration changes by {path.excitation_m_s2:.2f} m/s2 only: speed up, brake or turn"
         parallax_px = median_parallax(tracks, path.rotations) * self._camera.fx
-        if parallax_px < _AMPLE * config.min_parallax_px:
+        if parallax_px < _AMPLE * _MIN_PARALLAX_PX:
             return f"parallax is {parallax_px:.0f} px only: move sideways, or nearer to what is seen"
         if seen_s < 0.95 * config.mono_window_s:
             return f"{seen_s:.1f} s seen, more come"

@@ -15,7 +15,7 @@ from vislam.config import InitConfig, WindowConfig
 from vislam.core.camera import Camera
 from vislam.core.geometry import level_rotation, transform
 from vislam.core.messages import Array, ImuSpan, NavState, Observations, Tracking, VoMeasurement
-from vislam.frontend.start.answer import Initialisation, moving
+from vislam.frontend.start.answer import WINDOW_S, Initialisation, moving
 from vislam.frontend.start.from_tracks import Sighted, StartFromTracks
 from vislam.frontend.start.inertial_alignment import VisualMotion, Window, excitation, refine, solve_linear
 from vislam.frontend.start.refusals import Refusals
@@ -24,6 +24,17 @@ from vislam.frontend.start.views import Entry, FrameWindow, metric_motions
 from vislam.imu import ImuNoise, RestDetector, join
 from vislam.imu.resting import rest_accel_bias, rest_covariance
 
+# of the measured norm: accelerometer bias and scale of a calibrated sensor
+_GRAVITY_TOLERANCE_M_S2 = 0.5
+_WINDOW_MIN_S = 1.0  # try from here on
+_MONO_WINDOW_MIN_S = 1.0
+_NODE_SPACING_S = 0.1  # frames closer than this add noise and cost, not knowledge
+_VO_INFLATION = 1.5  # on the sigmas of relative motion, which share the keyframe's landmark errors
+_ATTEMPT_S = 0.3  # between attempts: one costs up to 0.1 s, and a window changes little in this time
+_MAX_NODES = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
+_MONO_MAX_NODES = 20  # the same without scale, where every node also carries its sightings of points
+# a metric start waits for this, no longer than its window: 3 mm at 1 m/s
+_MAX_TIME_OFFSET_SIGMA_S = 0.003
 _NS = 1_000_000_000
 
 
@@ -119,14 +130,14 @@ class Initialiser:
         if entries and not follows:
             self._restart("inertial data", "inertial data has a hole")
         self._window.append(whole, vo, observations, at_rest_by_image and follows)
-        self._window.trim(self._config.window_s if vo.has_scale else self._config.mono_window_s)
+        self._window.trim(WINDOW_S if vo.has_scale else self._config.mono_window_s)
         self.phase = self._next_phase(vo, still_by_imu and at_rest_by_image)
         match self.phase:
             case Phase.RESTING:
                 found = self._from_rest()
             case Phase.MOVING if vo.t_ns >= self._next_attempt_ns:
                 found = self._from_motion()
-                self._next_attempt_ns = vo.t_ns + round(self._config.attempt_s * _NS)
+                self._next_attempt_ns = vo.t_ns + round(_ATTEMPT_S * _NS)
             case Phase.COLLECTING:
                 found = self._refusals.refuse("duration", self._needed(vo))
             case _:
@@ -150,11 +161,11 @@ class Initialiser:
     def _next_phase(self, vo: VoMeasurement, still: bool) -> Phase:
         if still:
             return Phase.RESTING
-        need_s = self._config.window_min_s if vo.has_scale else self._config.mono_window_min_s
+        need_s = _WINDOW_MIN_S if vo.has_scale else _MONO_WINDOW_MIN_S
         return Phase.COLLECTING if self._window.seen_s < need_s else Phase.MOVING
 
     def _needed(self, vo: VoMeasurement) -> str:
-        need_s = self._config.window_min_s if vo.has_scale else self._config.mono_window_min_s
+        need_s = _WINDOW_MIN_S if vo.has_scale else _MONO_WINDOW_MIN_S
         return f"{self._window.seen_s:.2f} s of motion seen, {need_s:.2f} s needed"
 
     def _restart(self, cause: str, reason: str) -> Initialisation:
@@ -185,7 +196,7 @@ class Initialiser:
         span = join(spans)
         gyro, force = span.gyro_rad_s.mean(axis=0), span.accel_m_s2.mean(axis=0)
         norm = float(np.linalg.norm(force))
-        if abs(norm - self._gravity) > self._config.gravity_tolerance_m_s2:
+        if abs(norm - self._gravity) > _GRAVITY_TOLERANCE_M_S2:
             return self._refusals.contradiction(norm)
         T_odom_vo = transform(level_rotation(entries[-1].T_vo_body[:3, :3] @ force), np.zeros(3))
         poses = np.array([T_odom_vo @ entry.T_vo_body for entry in entries])
@@ -210,14 +221,14 @@ class Initialiser:
 
     def _from_metric_motion(self) -> Initialisation:
         """Align metric visual odometry with inertial data."""
-        config, refusals = self._config, self._refusals
+        refusals = self._refusals
         sigma_s = self.time_offset_sigma_s
-        if sigma_s > config.max_time_offset_sigma_s and self._window.seen_s < 0.95 * config.window_s:
-            limit_ms = 1e3 * config.max_time_offset_sigma_s
+        if sigma_s > _MAX_TIME_OFFSET_SIGMA_S and self._window.seen_s < 0.95 * WINDOW_S:
+            limit_ms = 1e3 * _MAX_TIME_OFFSET_SIGMA_S
             reason = f"camera clock known to {1e3 * sigma_s:.1f} ms of {limit_ms:.1f}; turn"
             return refusals.refuse("time offset", reason)
-        chosen = self._window.choose_nodes(config.node_spacing_s, config.max_nodes)
-        window = self._inertial_window(chosen, metric_motions(chosen, config.vo_inflation))
+        chosen = self._window.choose_nodes(_NODE_SPACING_S, _MAX_NODES)
+        window = self._inertial_window(chosen, metric_motions(chosen, _VO_INFLATION))
         linear = solve_linear(window)
         norm = float(np.linalg.norm(linear.gravity_m_s2))
         refusal = refusals.gravity(norm, linear.gravity_norm_sigma_m_s2)
@@ -234,7 +245,7 @@ class Initialiser:
         if self._by_tracks is None:
             reason = "without scale a moving start needs the camera's calibration"
             return self._refusals.refuse("calibration", reason)
-        chosen = self._window.choose_nodes(self._config.node_spacing_s, self._config.mono_max_nodes)
+        chosen = self._window.choose_nodes(_NODE_SPACING_S, _MONO_MAX_NODES)
         window = self._inertial_window(chosen, [])
         return self._by_tracks.solve(Sighted(chosen, window, self._window.seen_s, self.time_offset_sigma_s))
 

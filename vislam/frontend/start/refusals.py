@@ -10,6 +10,11 @@ from vislam.frontend.start.closed_form import InertialPath, Start, Tracks, media
 from vislam.frontend.start.solution import Solution
 from vislam.window.bundle import BundleSolution
 
+_MAX_TILT_SIGMA_DEG = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
+_MAX_VELOCITY_SIGMA_M_S = 0.2
+_MAX_GYRO_BIAS_SIGMA_RAD_S = 0.02
+# chi-square per degree of freedom; above it the model does not explain the window
+_MAX_RESIDUAL_RATIO = 3.0
 AGREE_SIGMAS = 3.0
 _MAX_OUTLIERS = 0.3  # of the observations
 _MAX_BIAS_SIGMAS = 3.5  # of the accelerometer's bias
@@ -97,8 +102,8 @@ class Refusals:
     def quality(self, solution: Solution, lacking: str) -> Initialisation | None:
         """Refuse a solution that is not known well enough; `lacking` is what the window lacks."""
         config = self._config
-        if solution.residual_ratio > config.max_residual_ratio:
-            reason = f"vision and IMU disagree: chi2 {solution.residual_ratio:.1f} of {config.max_residual_ratio:.1f}"
+        if solution.residual_ratio > _MAX_RESIDUAL_RATIO:
+            reason = f"vision and IMU disagree: chi2 {solution.residual_ratio:.1f} of {_MAX_RESIDUAL_RATIO:.1f}"
             advice = "per degree of freedom; check time stamps and extrinsics"
             return self.refuse("disagreement", f"{reason} {advice}", "failed")
         P = solution.last_covariance
@@ -106,9 +111,9 @@ class Refusals:
         gyro = np.sqrt(np.linalg.eigvalsh(P[9:12, 9:12])[-1])
         for name, value, limit, unit in (
             ("scale", solution.scale_sigma * 100.0, config.max_scale_sigma * 100.0, "%"),
-            ("tilt", np.rad2deg(solution.tilt_sigma_rad), config.max_tilt_sigma_deg, "deg"),
-            ("velocity", velocity, config.max_velocity_sigma_m_s, "m/s"),
-            ("gyro bias", gyro, config.max_gyro_bias_sigma_rad_s, "rad/s"),
+            ("tilt", np.rad2deg(solution.tilt_sigma_rad), _MAX_TILT_SIGMA_DEG, "deg"),
+            ("velocity", velocity, _MAX_VELOCITY_SIGMA_M_S, "m/s"),
+            ("gyro bias", gyro, _MAX_GYRO_BIAS_SIGMA_RAD_S, "rad/s"),
         ):
             if not value <= limit:
                 return self.refuse(name, f"{name} sigma {value:.3g} {unit} of {limit:.3g} needed: {lacking}")

@@ -11,6 +11,8 @@ from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Ages, Chips, Hello, Raw
 from vislam.hw.chips import mpu6050
 from vislam.hw.health import Health
 
+_CHIPS_S = 0.0005  # from a sample's time to its first byte: reading two chips at 400 kHz
+_MAG_DELAY_S = 0.0067  # half a period of 75 Hz
 _NS = 1_000_000_000
 _BITS_PER_BYTE = 10  # start, eight, stop
 _ADXL345, _MPU6050 = 0xE5, 0x68
@@ -34,10 +36,10 @@ class Behind:
         self._ages: Ages | None = None
         self._config = config
         wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
-        self.line_ns = round((wire_s + config.chips_s) * _NS)  # from a sample's time to its arrival on the clock's line
+        self.line_ns = round((wire_s + _CHIPS_S) * _NS)  # from a sample's time to its arrival on the clock's line
         # kept for what it is: a sum that is rounded once
-        self._gy85_ns = round((wire_s + config.chips_s + config.filter_s) * _NS)
-        self._gy85_mag_ns = round((wire_s + config.chips_s + config.mag_delay_s) * _NS)
+        self._gy85_ns = round((wire_s + _CHIPS_S + config.filter_s) * _NS)
+        self._gy85_mag_ns = round((wire_s + _CHIPS_S + _MAG_DELAY_S) * _NS)
         self._maps: tuple[Affine, Affine, Affine] | None = None  # gyro, accel, mag
         self._accel_before: tuple[int, Array] | None = None  # device time, counts
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     import serial
 
+_STUCK_S = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
 _NS = 1_000_000_000
 # pyserial raises all of them at a device that goes away; its own SerialException is an OSError
 PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
@@ -310,7 +311,7 @@ class SerialBridge:
 
     def _note_status(self, raw: RawSample, hello: Hello) -> None:
         """Count the faults that a sample reports, and those of its counts."""
-        faults, counts, stuck = Health(0), self._counts, round(self._config.stuck_s * hello.rate_hz)
+        faults, counts, stuck = Health(0), self._counts, round(_STUCK_S * hello.rate_hz)
         if Status.MISSED in raw.status:
             counts["device_late"] += 1
             self._events |= Health.IMU_GAP

@@ -13,6 +13,11 @@ from itertools import pairwise
 
 from vislam.config import BridgeClockConfig
 
+_WINDOW_S = 20.0  # of arrivals that the line is laid under; 0.1 ms of jitter then costs 5 ppm of rate
+_MAX_DRIFT = 0.025  # of the rate; a ceramic resonator, as on an Arduino Nano, is off by up to 0.5 %
+_STEP_S = 0.1  # before its time by so much is no jitter: the device restarted or the host slept
+_MAX_SLEW = 0.05  # share of an interval by which a better line may stretch it: 5 ms are caught up in 0.1 s
+_LATE_S = 2.0  # everything late by step_s for so long: the device's clock lost time
 _WRAP_US = 2**32
 
 
@@ -34,7 +39,7 @@ class DeviceClock:
         self.doubted = 0
         self.rate = 1.0  # host ns per device ns
         self._config = config
-        self._step_ns = config.step_s * 1e9
+        self._step_ns = _STEP_S * 1e9
         self._rate_known = False
         self._newest_stamp_ns = -1
         self._suspect: tuple[int, int] | None = None  # device us and arrival ns of a stamp that is off the line
@@ -51,7 +56,7 @@ class DeviceClock:
         point = _Point(self._unwrapped(device_us), arrival_ns)
         if self._last is not None and self._delay_ns(point) < -self._step_ns:  # before its time: no delay explains it
             suspect, self._suspect = self._suspect, (device_us, arrival_ns)
-            if suspect is None or (device_us - suspect[0]) % _WRAP_US > self._config.step_s * 1e6:
+            if suspect is None or (device_us - suspect[0]) % _WRAP_US > _STEP_S * 1e6:
                 self.doubted += 1
                 return None
             self.restart()
@@ -69,7 +74,7 @@ class DeviceClock:
         if self._last is None or not self._rate_known:
             return None
         since_us = (device_us - self._last.device_ns // 1000 + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
-        if abs(since_us) > self._config.step_s * 1e6:
+        if abs(since_us) > _STEP_S * 1e6:
             return None
         return round(self._line_ns(self._last.device_ns + since_us * 1000))
 
@@ -107,7 +112,7 @@ class DeviceClock:
     def _fit(self, now_ns: int) -> None:
         """Lay the line again under the least delayed arrivals of the window."""
         config, points = self._config, self._lowest
-        while points and points[0].device_ns < now_ns - config.window_s * 1e9:
+        while points and points[0].device_ns < now_ns - _WINDOW_S * 1e9:
             points.popleft()
         if not points:
             return
@@ -115,7 +120,7 @@ class DeviceClock:
         span_s = (points[-1].device_ns - points[0].device_ns) * 1e-9
         if span_s >= config.settle_s:
             self._rate_known = True
-            self.rate = min(max(_slope_below(list(points)), 1.0 - config.max_drift), 1.0 + config.max_drift)
+            self.rate = min(max(_slope_below(list(points)), 1.0 - _MAX_DRIFT), 1.0 + _MAX_DRIFT)
         self._anchor = min(points, key=self._delay_ns)
 
     def _forget_before_step(self, now_ns: int) -> None:
@@ -123,9 +128,9 @@ class DeviceClock:
 
         What was only read late, in one burst after the host was busy, arrived within no time and is no such case.
         """
-        config, points = self._config, self._lowest
-        late = [point for point in points if point.device_ns >= now_ns - config.late_s * 1e9]
-        if not late or late[-1].host_ns - late[0].host_ns < config.late_s * 0.5e9:
+        points = self._lowest
+        late = [point for point in points if point.device_ns >= now_ns - _LATE_S * 1e9]
+        if not late or late[-1].host_ns - late[0].host_ns < _LATE_S * 0.5e9:
             return
         if min(map(self._delay_ns, late)) > self._step_ns:
             self.steps += 1
@@ -138,7 +143,7 @@ class DeviceClock:
         line_ns = self._line_ns(point.device_ns)
         if self._slewed is not None:
             passed_ns = (point.device_ns - self._slewed[0]) * self.rate
-            reach_ns = passed_ns * self._config.max_slew
+            reach_ns = passed_ns * _MAX_SLEW
             line_ns = self._slewed[1] + passed_ns + min(max(line_ns - self._slewed[1] - passed_ns, -reach_ns), reach_ns)
         stamp_ns = round(line_ns)
         self._slewed = (point.device_ns, stamp_ns)

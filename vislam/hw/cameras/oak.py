@@ -15,6 +15,7 @@ from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_
 from vislam.hw.cameras.library_camera import LibraryCamera, named
 from vislam.hw.cameras.oak_depth import colour_and_depth, colour_camera, set_exposure
 from vislam.hw.cameras.oak_imu import CM, OakClock, OakMotion, imu_pose, in_ns
+from vislam.hw.cameras.video import MAX_AGE_S
 from vislam.hw.cameras.webcam import Setting
 from vislam.hw.own_imu import OwnImu
 
@@ -37,7 +38,7 @@ class OakStream:
         self._with_depth = with_depth
         self._period_ns = round(1e9 / config.rate_hz)
         self.stamped_by, self.bad_stamps = "not known yet", 0
-        self._clock = OakClock(self._dai, config.max_age_s)
+        self._clock = OakClock(self._dai, MAX_AGE_S)
         self._motion: OakMotion | None = None
         self._pipeline: Any = None
         self._device = _device(self._dai, config)

@@ -11,6 +11,7 @@ import numpy as np
 from vislam.config import PicamConfig
 from vislam.core.errors import HardwareError, install_line
 from vislam.hw.cameras.library_camera import LibraryCamera
+from vislam.hw.cameras.video import MAX_AGE_S
 from vislam.hw.cameras.webcam import Setting
 from vislam.hw.source import CapturedImage
 
@@ -40,7 +41,7 @@ class PicamStream:
             )
         self._camera = module.Picamera2(number)
         self.stamped_by, self.bad_stamps = "not known yet", 0
-        self._max_age_ns = round(config.max_age_s * _NS)
+        self._max_age_ns = round(MAX_AGE_S * _NS)
         self._age_ns = _DELAY_NS
         try:
             self.settings = self._started(config)

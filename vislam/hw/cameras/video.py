@@ -15,6 +15,7 @@ from vislam.hw.cameras.mailbox import Mailbox
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
 
+MAX_AGE_S = 1.0  # of a stamp at arrival; older, it is from another clock
 _NS = 1_000_000_000
 _JOIN_S = 5.0  # decoding one image takes milliseconds
 _STEP_S = 0.2  # at most, before looking whether to stop

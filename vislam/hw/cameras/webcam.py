@@ -17,6 +17,7 @@ from vislam.config import BridgeClockConfig, WebcamConfig
 from vislam.core.errors import HardwareError
 from vislam.hw.bridge.clock import DeviceClock
 from vislam.hw.cameras.mailbox import Mailbox
+from vislam.hw.cameras.video import MAX_AGE_S
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
 
@@ -193,7 +194,7 @@ class _Stamper:
         self.bad = 0
         self.source = "not known yet"
         self._clock = DeviceClock(BridgeClockConfig())  # of the camera, where it has one of its own
-        self._max_age_ns = round(config.max_age_s * _NS)
+        self._max_age_ns = round(MAX_AGE_S * _NS)
         self._delay_ns = round(config.delay_s * _NS)
         self._votes: Counter[str] = Counter()
 

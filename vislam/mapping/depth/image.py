@@ -17,6 +17,9 @@ from vislam.core.errors import DataError
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageF32
 
+_EDGE_RATIO = 0.03  # a step to a neighbour pixel of more than this share of depth is an object's border
+
+
 ImageU16 = NDArray[np.uint16]
 
 _FINEST_UNIT_M = 0.0002  # that of TUM's depth images, which are kept exactly; 13 m in 16 bits
@@ -99,7 +102,7 @@ def filter_depth(depth_m: ImageF32, step: int, view: DepthView, config: MapConfi
     """Return the trusted depth on the view's grid in the view's units [h, w], 0 where there is none.
 
     Left out: depth that is not finite, nearer than `min_range_m`, within `edge_px` of a jump that is steeper than
-    `edge_ratio` per pixel (sensors smear objects' borders), or in a connected surface of fewer than `speckle_pixels`.
+    3 % per pixel (sensors smear objects' borders), or in a connected surface of fewer than `speckle_pixels`.
     Raises DataError when the image is not `step` times the view's size.
     """
     expected = tuple(-(-n // step) for n in depth_m.shape)
@@ -109,9 +112,9 @@ def filter_depth(depth_m: ImageF32, step: int, view: DepthView, config: MapConfi
             f"{view.size[0] * step}x{view.size[1] * step}; register depth to cam0 and give its calibration"
         )
     depth = np.ascontiguousarray(depth_m, dtype=np.float32)
-    kept = _away_from_edges(depth, step, config.min_range_m, config.edge_ratio, config.edge_px, view.unit_m)
+    kept = _away_from_edges(depth, step, config.min_range_m, _EDGE_RATIO, config.edge_px, view.unit_m)
     # neighbours on the coarser grid lie `step` pixels apart, so a surface may step by as many times the ratio
-    _remove_speckles(kept, config.edge_ratio * step, config.speckle_pixels)
+    _remove_speckles(kept, _EDGE_RATIO * step, config.speckle_pixels)
     return np.asarray(kept)
 
 

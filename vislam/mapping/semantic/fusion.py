@@ -20,6 +20,7 @@ from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.votes import VoxelVotes, voxel_centres
 
+_MAX_VOXELS = 1_000_000  # that have labels, 40 MB; what is seen after that has none
 _MOST_WAITING = 16  # keyframes whose depth comes late
 
 
@@ -32,7 +33,7 @@ class LabelFusion:
         self._config = config
         self._waiting: dict[int, NDArray[np.uint16]] = {}  # labels of keyframes whose depth is not known yet
         self._poses: dict[int, Array] = {}  # at which keyframes were counted
-        self._votes = VoxelVotes(resolution_m, config.max_voxels)
+        self._votes = VoxelVotes(resolution_m, _MAX_VOXELS)
 
     @property
     def notes(self) -> dict[str, str]:
@@ -58,7 +59,7 @@ class LabelFusion:
         done = self._poses
         is_prefix = list(T_map_body)[: len(done)] == list(done)
         if not is_prefix or any(not np.array_equal(T, T_map_body[i]) for i, T in done.items()):
-            self._poses, self._votes = {}, VoxelVotes(self._resolution_m, self._config.max_voxels)
+            self._poses, self._votes = {}, VoxelVotes(self._resolution_m, _MAX_VOXELS)
         for keyframe_id in list(T_map_body)[len(self._poses) :]:
             T = T_map_body[keyframe_id]
             self._count(keyframe_id, T, store, view)

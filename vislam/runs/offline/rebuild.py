@@ -41,7 +41,7 @@ Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is 
 
 # what is left of a depth image or stereo pair after these is all that a session keeps
 _EXTRACTION = (
-    "min_range_m", "pixel_step", "edge_ratio", "edge_px", "speckle_pixels", "stereo_scale",
+    "min_range_m", "pixel_step", "edge_px", "speckle_pixels", "stereo_scale",
 )  # fmt: skip
 
 

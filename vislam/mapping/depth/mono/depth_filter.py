@@ -17,6 +17,8 @@ from vislam.mapping.depth.mono.prior import carried_over, close_gaps, flat_prior
 from vislam.mapping.depth.mono.smoothing import smoothed, supported
 from vislam.mapping.depth.mono.update import CONVERGED, FLAT, SEARCHED, Belief, Rules, Views, update_rows
 
+_SMOOTHING = 10  # steps of smoothing inside surfaces; 0: none
+_MIN_GOOD = 0.6  # share of good measurements (REMODE); half of it, and the pixel has failed
 _BAND_ROWS = 8  # of the image, one task each: small enough that two threads end together
 _GAP_TOLERANCE = 0.02  # of depth, among the neighbours of a hole that is closed
 _RIGID_TOLERANCE = 1e-4
@@ -125,8 +127,8 @@ class DepthFilter:
     def _smooth(self) -> ImageF32:
         known = supported(self.belief.rho, self.known)
         rho = np.where(known, self.belief.rho, np.float32(0.0))
-        if self._config.smoothing > 0:
-            rho = smoothed(rho, self.belief.variance, known, self._image, self._config.smoothing)
+        if _SMOOTHING > 0:
+            rho = smoothed(rho, self.belief.variance, known, self._image, _SMOOTHING)
         return np.asarray(close_gaps(rho, _GAP_TOLERANCE))
 
     def _derotated(self, image: ImageF32, R_cur_ref: Array) -> ImageF32:
@@ -145,7 +147,7 @@ def rules(config: MonoDepthConfig, noise: float) -> Rules:
     return Rules(
         CODES[config.measure], config.fusion == "beta", config.step_px, config.reach_px, config.search_sigmas, least,
         config.uniqueness, config.sigma_px, config.min_gradient, config.max_sigma_ratio, config.converged,
-        config.min_matches, config.max_misses, config.min_good, 1.0 / config.max_depth_m, 1.0 / config.min_depth_m,
+        config.min_matches, config.max_misses, _MIN_GOOD, 1.0 / config.max_depth_m, 1.0 / config.min_depth_m,
         -1.0 if config.model_sigma_px is None else config.model_sigma_px, noise,
         np.inf if config.warp_px is None else config.warp_px,
     )  # fmt: skip

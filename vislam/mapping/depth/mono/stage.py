@@ -17,6 +17,8 @@ from vislam.mapping.depth.mono.depth_filter import DepthFilter
 from vislam.mapping.depth.mono.prior import flat_prior, points_prior
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
+_FRAMES_PER_KEYFRAME = 6  # used between two keyframes, the newer one included; bounds the time
+_MIN_OVERLAP = 0.5  # of the image that later ones must still see; less, and the next is begun at once
 _GRID = 5  # points across and down that show how much of the reference image a camera still sees
 _POINT_ERROR_PX = 3.0  # of a track against its epipolar line, in a full image
 _POINT_RATIO = 0.3  # sigma of a point's inverse depth over it, if a track is a pixel off
@@ -128,7 +130,7 @@ class MonoDepth:
         assert reference is not None
         T_ref_last = invert(self._T_map_reference) @ motion.T_map_from
         usable = [frame for frame in seen if frame.keyframe_id == motion.from_id and frame.t_ns < motion.to_t_ns]
-        wanted = min(self._config.frames_per_keyframe - 1, len(usable))
+        wanted = min(_FRAMES_PER_KEYFRAME - 1, len(usable))
         chosen = [usable[(i + 1) * len(usable) // (wanted + 1)] for i in range(wanted)]
         images = [(frame.image, motion.at(frame.t_ns, frame.T_keyframe_body)) for frame in chosen]
         for image, T_last_body in [*images, (newest.images[0], motion.T_from_to)]:
@@ -152,7 +154,7 @@ class MonoDepth:
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = pixels[:, :2] / pixels[:, 2:]
             inside = (points[:, 2] > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels < self._size).all(axis=1)
-        return bool(inside.mean() < self._config.min_overlap)
+        return bool(inside.mean() < _MIN_OVERLAP)
 
     def _finished(self) -> LateDepth | None:
         reference, self._reference = self._reference, None
