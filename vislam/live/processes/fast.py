@@ -19,7 +19,6 @@ from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.imu import AttitudeFilter, BiasMemory, ImuNoise
 from vislam.live.fast import FastPath
-from vislam.live.latency import Latency
 from vislam.live.notices import Start, ToFast
 from vislam.live.priority import take_priority
 from vislam.live.processes.child import Life
@@ -31,6 +30,9 @@ from vislam.sensors import Suite
 _NS = 1_000_000_000
 _READ_S = 0.005  # most that reading waits: messages of vision are looked for in between
 _NOTE_S = 0.5
+_BIN_NS = 5_000  # of the histogram of latencies
+_BINS = 40_000  # up to 0.2 s; what is longer counts into the last
+_PARTS = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
 
 
 def run(
@@ -63,7 +65,7 @@ def run(
     take_priority(config.live, life)
     publisher = PosePublisher(config.live.name, config.live.send_to, config.live.allow_remote)
     sender = SampleSender(samples)
-    latency = Latency()
+    latency = _Latency()
     try:
         source = open_source()
         try:
@@ -84,7 +86,7 @@ def run(
 
 
 def _loop(
-    life: Life, fast: FastPath, source: InertialSource, sender: SampleSender, inbox: Messages, latency: Latency
+    life: Life, fast: FastPath, source: InertialSource, sender: SampleSender, inbox: Messages, latency: _Latency
 ) -> None:
     gc.collect()
     gc.freeze()
@@ -167,3 +169,25 @@ def _ignore(pose: PublishedPose) -> None:
 
 def _well() -> Health:
     return Health(0)
+
+
+class _Latency:
+    """Histogram of how long poses take from sample to publication: constant memory over days."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BINS, dtype=np.int64)
+        self._largest_ns = 0
+
+    def add(self, ns: int) -> None:
+        """Count one duration."""
+        self._counts[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += 1
+        self._largest_ns = max(self._largest_ns, ns)
+
+    def summary_ms(self) -> dict[str, float]:
+        """Return quantiles, the largest and the count; only the count while there is none."""
+        count = int(self._counts.sum())
+        if count == 0:
+            return {"count": 0}
+        below = np.cumsum(self._counts)
+        quantiles = {name: (int(np.searchsorted(below, q * count)) + 1) * _BIN_NS * 1e-6 for name, q in _PARTS.items()}
+        return {**quantiles, "max": self._largest_ns * 1e-6, "count": count}
