@@ -8,31 +8,26 @@ owes is a covariance that says so. Rest is information: somebody who knows that 
 
 import numpy as np
 
-from vislam.config import EkfConfig, MachineConfig
-from vislam.core.messages import ImuSample, NavState
-from vislam.ekf import Ekf
+from vislam import Ekf, ImuSample, NavState
 from vislam.sim import open_points
 
 world = open_points("laps", seed=3, duration_s=14.0)  # 3 s of rest, then a walk
 samples = [value for value in world.events() if isinstance(value, ImuSample)]
 truth = world.true_states(np.array([sample.t_ns for sample in samples[:-1]]))
 
-# the filter starts from a state with a covariance: rotation, position, velocity, gyro bias, accel bias
-sigmas = np.repeat([2e-3, 1e-4, 1e-3, 1e-4, 2e-2], 3)
-start = NavState(
-    t_ns=samples[0].t_ns,
-    T_world_body=truth.T_world_body[0],
-    velocity_world_m_s=truth.velocity_world_m_s[0],
+# the filter starts from a state with a sigma for each of its parts; `Ekf.at_rest(samples, noise)` finds one itself
+start = NavState.with_sigmas(
+    samples[0].t_ns, truth.T_world_body[0], (2e-3, 1e-4),
+    velocity_world_m_s=truth.velocity_world_m_s[0], sigma_m_s=1e-3,
     gyro_bias_rad_s=truth.gyro_bias_rad_s[0],
     accel_bias_m_s2=truth.accel_bias_m_s2[0] + [0.02, -0.02, 0.0],  # one sigma wrong, as in real life
-    covariance=np.diag(sigmas**2),
-)
+    bias_sigmas=(1e-4, 2e-2),
+)  # fmt: skip
 
 
 def dead_reckoned(rest_until_s: float) -> list[tuple[float, float]]:
     """Return error and sigma of the position after each second of motion, told of the rest before it or not."""
-    ekf = Ekf(EkfConfig(), world.imu_noise, MachineConfig())
-    ekf.initialise(start)
+    ekf = Ekf.from_state(start, world.imu_noise)
     out = []
     for k, sample in enumerate(samples[:-1]):
         ekf.predict(sample)

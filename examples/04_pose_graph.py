@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.batch import optimize_pose_graph, read_pose_graph, write_pose_graph
-from vislam.batch.posegraph.worlds import simulate_graph, write_simulated
+from vislam.batch import optimize_pose_graph, read_pose_graph, simulate_graph, write_pose_graph, write_simulated
 from vislam.config import GraphWorldConfig, PoseGraphConfig
-from vislam.core.geometry import align_points, sim3_parts
+from vislam.core import align_points, sim3_parts
 
 made = simulate_graph("manhattan", GraphWorldConfig(poses=600, outlier_fraction=0.02, seed=7))
 

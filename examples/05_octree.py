@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.mapping.octree.occupancy import Occupancy, Octree
-from vislam.mapping.octree.octomap_io import encode_bt, read_octree
-from vislam.mapping.octree.query import nearest_obstacle, ray_cast, sphere_state
+from vislam import Octree
+from vislam.mapping.octree import Occupancy, nearest_obstacle, ray_cast, sphere_state
 
 # a scan: rays from the origin to a wall at x = 4 m, or to the pillar, a disc of 0.3 m radius around (2, 0)
 angle, slope = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.7, 0.7, 400), np.linspace(-0.2, 0.2, 120)))
@@ -42,8 +41,8 @@ print(f"from (1, 0) the next obstacle is {near.distance_m[0]:.2f} m away")
 # .bt is OctoMap's own format: octovis shows it, and any planner reads it
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "map.bt"
-    path.write_bytes(encode_bt(grid.max_likelihood_leaves()))
-    again = Octree.from_leaves(read_octree(path))
+    grid.save(path)
+    again = Octree.load(path)
     print(f"{path.stat().st_size} bytes on disk")
 
 assert states.tolist() == [Occupancy.FREE, Occupancy.UNKNOWN, Occupancy.FREE]

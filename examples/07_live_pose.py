@@ -13,10 +13,9 @@ import time
 
 import numpy as np
 
-from vislam.core.geometry import se3_exp
-from vislam.hw.health import Health
-from vislam.live.wire.published_pose import PublishedPose
-from vislam.live.wire.publisher import PosePublisher, PoseReader
+from vislam.core import se3_exp
+from vislam.hw import Health
+from vislam.live import PosePublisher, PoseReader, PublishedPose
 
 NAME = f"vislam-example-{os.getppid() if sys.argv[1:] == ['control'] else os.getpid()}"
 

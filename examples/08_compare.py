@@ -9,10 +9,8 @@ themselves. Which is better, with one camera and a cheap IMU? `vislam compare PL
 import numpy as np
 
 from vislam.config import Config, load
-from vislam.core.clock import StageClock
-from vislam.core.errors import VislamError
-from vislam.core.messages import Frame
-from vislam.pipeline.front import Front
+from vislam.core import Frame, StageClock, VislamError
+from vislam.pipeline import Front
 from vislam.sim import open_points
 from vislam.trajectory import Trajectory, evaluate
 

@@ -12,11 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.core.geometry import align_points, level_rotation, transform
-from vislam.core.messages import Frame, ImuSample, Observations
-from vislam.experiment.compare import run_comparison
-from vislam.experiment.options import CompareOptions
-from vislam.experiment.programs import Setup
+from vislam.core import Frame, ImuSample, Observations, align_points, level_rotation, transform
+from vislam.experiment import CompareOptions, Setup, run_comparison
 from vislam.trajectory import Trajectory
 
 PLAN = """

@@ -13,12 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from vislam import Config, Slam, open_source
-from vislam.config.ranges import Positive
-from vislam.datasets.sensor_files import sensor_readings
-from vislam.datasets.tables import Problems
-from vislam.sensors import BodyState, Configured, Variable, load_sensor_setup, register
-from vislam.sensors.simulated import drawn_readings
-from vislam.sensors.true_path import bodies_on
+from vislam.config import Positive
+from vislam.datasets import Problems, sensor_readings
+from vislam.sensors import BodyState, Configured, Variable, bodies_on, drawn_readings, load_sensor_setup, register
 
 
 @dataclass(frozen=True)

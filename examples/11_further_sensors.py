@@ -15,7 +15,7 @@ import numpy as np
 
 from vislam import Config, Slam, open_source
 from vislam.config import FurtherSensorsConfig
-from vislam.runs.further_sensors import further_readings
+from vislam.runs import further_readings
 from vislam.trajectory import Trajectory, evaluate
 
 WORLD = "points:cart-drive,rig=stereo,duration_s=16,camera_hz=5,tracks=60,outage_begin_s=8,outage_length_s=4"

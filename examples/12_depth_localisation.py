@@ -14,11 +14,9 @@ import numpy as np
 
 from vislam import load_run, open_source
 from vislam.config import load
-from vislam.core.geometry import invert, se3_exp, se3_log
-from vislam.core.messages import Frame
-from vislam.mapping.depth.localise import Guess
-from vislam.runs import execute
-from vislam.runs.offline.depth_localiser import depth_localiser
+from vislam.core import Frame, invert, se3_exp, se3_log
+from vislam.mapping import Guess
+from vislam.runs import depth_localiser, execute
 
 recording = open_source("sim:handheld-room,camera_hz=5,image_width_px=320,duration_s=8")
 

@@ -9,9 +9,8 @@ keyframe has a vote per voxel, so the map is right where several saw the same pl
 import numpy as np
 
 from vislam import Config, Slam, open_source
-from vislam.core.messages import Array, Frame
-from vislam.mapping.semantic.classes import LabelClasses
-from vislam.mapping.semantic.query import label_at, nearest, things_of
+from vislam.core import Array, Frame
+from vislam.mapping import LabelClasses, label_at, nearest, things_of
 from vislam.sim.scene import NAMES
 
 WORLD = "sim:handheld-room,duration_s=12,camera_hz=10,image_width_px=320"

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vislam.batch.posegraph.graph_file import PoseGraphFile
     from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
     from vislam.batch.posegraph.problem import PoseGraphProblem
+    from vislam.batch.posegraph.worlds import simulate_graph, write_simulated
 
 __all__ = [
     "BatchResult",
@@ -23,7 +24,9 @@ __all__ = [
     "optimize_pose_graph",
     "optimize_run",
     "read_pose_graph",
+    "simulate_graph",
     "write_pose_graph",
+    "write_simulated",
 ]
 
 __getattr__ = late(
@@ -38,5 +41,7 @@ __getattr__ = late(
         "PoseGraphSolution": "vislam.batch.posegraph.optimize",
         "optimize_pose_graph": "vislam.batch.posegraph.optimize",
         "PoseGraphProblem": "vislam.batch.posegraph.problem",
+        "simulate_graph": "vislam.batch.posegraph.worlds",
+        "write_simulated": "vislam.batch.posegraph.worlds",
     },
 )

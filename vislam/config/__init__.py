@@ -21,7 +21,7 @@ from vislam.config.machine import USUAL_SLIP_M_S, MachineConfig
 from vislam.config.mapping import DriveConfig, LabelConfig, MapConfig, MapProduct, MonoDepthConfig
 from vislam.config.moved import known, renamed
 from vislam.config.profiles import merged, profile
-from vislam.config.ranges import Whole, check_ranges
+from vislam.config.ranges import Finite, NonNegative, Positive, Whole, check_ranges
 from vislam.config.sensors import (
     Axes,
     BoardConfig,
@@ -58,6 +58,7 @@ __all__ = [
     "DepthCameraConfig",
     "DriveConfig",
     "EkfConfig",
+    "Finite",
     "FrontEndConfig",
     "FurtherSensorsConfig",
     "GraphConfig",
@@ -76,10 +77,12 @@ __all__ = [
     "MapProduct",
     "Matrix3",
     "MonoDepthConfig",
+    "NonNegative",
     "OakConfig",
     "PicamConfig",
     "PlanarConfig",
     "PoseGraphConfig",
+    "Positive",
     "PowerUpConfig",
     "PublishConfig",
     "RealsenseConfig",

@@ -1,1 +1,21 @@
 """Sensors of the cart: inertial chips, serial bridge, webcam. Every driver stamps at capture and counts its faults."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vislam.core.late import late
+
+if TYPE_CHECKING:
+    from vislam.hw.health import Health
+
+__all__ = [
+    "Health",
+]
+
+__getattr__ = late(
+    __name__,
+    {
+        "Health": "vislam.hw.health",
+    },
+)

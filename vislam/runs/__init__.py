@@ -13,8 +13,21 @@ from vislam.core.late import late
 if TYPE_CHECKING:
     from vislam.runs.begin import begun, check_fits, execute, map_of, resume
     from vislam.runs.drive import Progress, Run, imu_noise
+    from vislam.runs.further_sensors import further_readings
+    from vislam.runs.offline.depth_localiser import depth_localiser
 
-__all__ = ["Progress", "Run", "begun", "check_fits", "execute", "imu_noise", "map_of", "resume"]
+__all__ = [
+    "Progress",
+    "Run",
+    "begun",
+    "check_fits",
+    "depth_localiser",
+    "execute",
+    "further_readings",
+    "imu_noise",
+    "map_of",
+    "resume",
+]
 
 __getattr__ = late(
     __name__,
@@ -25,6 +38,8 @@ __getattr__ = late(
         "map_of": "vislam.runs.begin",
         "resume": "vislam.runs.begin",
         "Progress": "vislam.runs.drive",
+        "depth_localiser": "vislam.runs.offline.depth_localiser",
+        "further_readings": "vislam.runs.further_sensors",
         "Run": "vislam.runs.drive",
         "imu_noise": "vislam.runs.drive",
     },

@@ -1,17 +1,25 @@
 """Sensors other than IMU and camera: one definition of each, which both filters and the graph use alike."""
 
+from typing import TYPE_CHECKING
+
+from vislam.core.late import late
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured
-from vislam.sensors.linear import Linear, SensorError, linearised
+from vislam.sensors.linear import Linear, SensorError, derived, linearised
 from vislam.sensors.registry import kind_class, register
 from vislam.sensors.sensor import Begun, Sensor, Variable
 from vislam.sensors.suite import Suite
 from vislam.sensors.toml import SensorFile, SensorSetup, load_sensor_setup
 
+if TYPE_CHECKING:
+    from vislam.sensors.simulated import Faults, drawn_readings
+    from vislam.sensors.true_path import bodies_on
+
 __all__ = [
     "Begun",
     "BodyState",
     "Configured",
+    "Faults",
     "Linear",
     "Sensor",
     "SensorError",
@@ -19,8 +27,20 @@ __all__ = [
     "SensorSetup",
     "Suite",
     "Variable",
+    "bodies_on",
+    "derived",
+    "drawn_readings",
     "kind_class",
     "linearised",
     "load_sensor_setup",
     "register",
 ]
+
+__getattr__ = late(
+    __name__,
+    {
+        "Faults": "vislam.sensors.simulated",
+        "bodies_on": "vislam.sensors.true_path",
+        "drawn_readings": "vislam.sensors.simulated",
+    },
+)

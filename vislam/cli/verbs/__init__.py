@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 from vislam.core.kinds import Kinds, lacking
 
+__all__ = ["VERBS", "Verb"]
+
 
 @dataclass(frozen=True, slots=True)
 class Verb:
