@@ -15,7 +15,7 @@ from vislam.config.batch import BatchConfig, GraphWorldConfig, PoseGraphConfig
 from vislam.config.estimators import EkfConfig, GraphConfig, PublishConfig, WindowConfig
 from vislam.config.frontend import CalibrationConfig, FrontEndConfig, InitConfig, PlanarConfig
 from vislam.config.inertial import AttitudeConfig, ImuConfig, PowerUpConfig, VibrationConfig
-from vislam.config.live import LiveConfig, ViewConfig
+from vislam.config.live import LiveConfig, VerdictConfig, ViewConfig
 from vislam.config.loop import LoopConfig, LoopTruthConfig
 from vislam.config.machine import USUAL_SLIP_M_S, MachineConfig
 from vislam.config.mapping import DriveConfig, LabelConfig, MapConfig, MapProduct, MonoDepthConfig
@@ -42,7 +42,6 @@ from vislam.config.sensors import (
     Vector3,
     WebcamConfig,
 )
-from vislam.config.verdict import VerdictConfig
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 

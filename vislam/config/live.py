@@ -1,9 +1,9 @@
-"""Defaults of live runs and of the viewer."""
+"""Defaults of live runs, of the viewer and of the verdict."""
 
 from dataclasses import dataclass
 from typing import Annotated
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability, Range, Share
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,3 +39,15 @@ class ViewConfig:
     cloud_points: Count = 4000  # per keyframe, from depth; sparse features are all kept
     map_every_s: Positive = 5.0  # octree and grid are written again so often at most
     map_voxels: Count = 20_000  # at most in each, larger maps get coarser ones; 16 bytes each
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictConfig:
+    """When a run is doubted. Sigmas are those of classes of sensors, not of a recording."""
+
+    # of each test to pass where nothing is wrong: some 15 tests, 1 doubt in 60 sound runs
+    probability: Probability = 0.999
+    # of the camera on the body as told: Kalibr is good to 0.1, a printed mount to 1
+    rotation_sigma_deg: NonNegative = 0.5
+    accel_bias_sigma_m_s2: NonNegative = 0.2  # as `init.accel_bias_sigma_m_s2`: of a calibrated cheap accelerometer
+    min_coverage: Share = 0.5  # of the frames that must have a pose; below, the run is lost

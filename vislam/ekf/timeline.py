@@ -42,10 +42,7 @@ class Timeline(Generic[S, M]):
     """
 
     def __init__(self, core: Core[S, M], state: S, history_s: float, max_gap_s: float) -> None:
-        """Set up an uninitialised filter of which `state` is a placeholder.
-
-        A hole in the samples longer than `max_gap_s` is bridged with the filter's gap sigmas, and counted.
-        """
+        """Set up an uninitialised filter; holes in the samples longer than `max_gap_s` are bridged and counted."""
         self._core = core
         self._state = state
         self._checkpoint_ns = round(_CHECKPOINT_S * _NS)

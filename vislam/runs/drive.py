@@ -75,10 +75,7 @@ class Run:
     def __init__(
         self, recording: Recording, config: Config, out: Path, session: SessionWriter, slam: Pipeline | None = None
     ) -> None:
-        """Open the outputs in an existing folder; `session` is a new one, or that of a run to `resume`.
-
-        Without `slam` the pipeline is made here.
-        """
+        """Open the outputs in a folder; `session` is new or of a run to `resume`, `slam` is made here where None."""
         cv2.setNumThreads(1)  # replay must not depend on how OpenCV splits its work
         self.recording = shaken(without_idle_cameras(recording, config), config.imu.vibration)
         further = None if slam else further_readings(recording, config.sensors, config.seed)
