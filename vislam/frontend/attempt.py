@@ -19,6 +19,7 @@ from vislam.vision.refine import PoseEstimate
 DEGRADED_INLIERS = 40  # fewer: degraded
 _MIN_INLIER_RATIO = 0.3  # of the followed tracks; below, the agreement may be chance
 DEGRADED_INLIER_RATIO = 0.5  # of the followed tracks
+_CONTRADICTING_SHARE = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
 _MIN_EXPECTED_SHARE = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
 
 
@@ -94,7 +95,7 @@ def confirmed(placing: T, astray: NDArray[np.bool_], place: Callable[[Array], T]
         config: the shares that decide.
     """
     agree = int(placing.agreeing.sum())
-    if not placing.failure and (astray & placing.agreeing).sum() <= config.contradicting_share * agree:
+    if not placing.failure and (astray & placing.agreeing).sum() <= _CONTRADICTING_SHARE * agree:
         return placing
     other = place(np.where(astray[:, None], np.nan, placing.pixels))
     few = int(other.agreeing.sum()) < _MIN_EXPECTED_SHARE * placing.followed

@@ -13,6 +13,8 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import Array, ImuSample, ImuSpan, NavState
 from vislam.imu.rest import is_still, still_limits
 
+# of the measured norm: accelerometer bias and scale of a calibrated sensor
+GRAVITY_TOLERANCE_M_S2 = 0.5
 _LEVEL_ACCEL_SIGMA_M_S2 = 1.5  # of a body that may move: a hand or a drone; 9 deg of tilt
 _LEVEL_SPEED_SIGMA_M_S = 2.0  # of the same
 _NS = 1_000_000_000
@@ -48,10 +50,10 @@ def state_at_rest(
             f"{np.linalg.norm(span.accel_m_s2.std(axis=0)):.2g} m/s^2; give a state by NavState.with_sigmas"
         )
     norm = float(np.linalg.norm(force))
-    if abs(norm - gravity_m_s2) > config.gravity_tolerance_m_s2:
+    if abs(norm - gravity_m_s2) > GRAVITY_TOLERANCE_M_S2:
         raise DataError(
             f"the force at rest is {norm:.2f} m/s^2, gravity {gravity_m_s2:.2f}, allowed difference "
-            f"{config.gravity_tolerance_m_s2:g} (init.gravity_tolerance_m_s2); calibrate the accelerometer"
+            f"{GRAVITY_TOLERANCE_M_S2:g} (init.gravity_tolerance_m_s2); calibrate the accelerometer"
         )
     R = level_rotation(force)
     covariance = rest_covariance(span, R, gravity_m_s2, config, noise)

@@ -23,14 +23,14 @@ from vislam.frontend.start.closed_form import (
     solve_start,
 )
 from vislam.frontend.start.inertial_alignment import Window
-from vislam.frontend.start.refusals import AGREE_SIGMAS, MOST_NOISE, Refusals, bias_m_s2
+from vislam.frontend.start.refusals import AGREE_SIGMAS, MIN_PARALLAX_PX, MOST_NOISE, Refusals, bias_m_s2
 from vislam.frontend.start.solution import Solution, from_bundle
 from vislam.frontend.start.views import Entry, gather_tracks
 from vislam.window.bundle import BundleSolution
 
 _SETTLED_SCALE_SIGMA = 0.03  # of a start that is final, unless the window has reached its length before
+VO_INFLATION = 1.5  # on the sigmas of relative motion, which share the keyframe's landmark errors
 _MAX_POINTS = 60  # monocular: points solved for; more cost time and hardly sharpen scale
-_MIN_PARALLAX_PX = 12.0  # monocular: median over the points; below, depth and so scale drown in noise
 _NS = 1_000_000_000
 _AMPLE = 3.0  # times the least excitation or parallax; more of it is no longer what a start lacks
 _FOREIGN_OFFSET_S = 0.002  # a time offset found in the window that is larger than this is applied before the start
@@ -119,7 +119,7 @@ class StartFromTracks:
             with suppress(np.linalg.LinAlgError):
                 bundle = refine_tracks(
                     window, sighted.chosen, tracks, path, first(), self._bundle_config, rig, sighted.offset_sigma_s,
-                    self._config.vo_inflation,
+                    VO_INFLATION,
                 )  # fmt: skip
                 if bundle.converged and bias_m_s2(bundle) <= self._refusals.most_bias_m_s2:
                     return start, bundle
@@ -187,7 +187,7 @@ class StartFromTracks:
         if path.excitation_m_s2 < _AMPLE * config.min_excitation_m_s2:
             return f"acceleration changes by {path.excitation_m_s2:.2f} m/s2 only: speed up, brake or turn"
         parallax_px = median_parallax(tracks, path.rotations) * self._camera.fx
-        if parallax_px < _AMPLE * _MIN_PARALLAX_PX:
+        if parallax_px < _AMPLE * MIN_PARALLAX_PX:
             return f"parallax is {parallax_px:.0f} px only: move sideways, or nearer to what is seen"
         if seen_s < 0.95 * config.mono_window_s:
             return f"{seen_s:.1f} s seen, more come"

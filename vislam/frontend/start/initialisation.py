@@ -16,20 +16,17 @@ from vislam.core.camera import Camera
 from vislam.core.geometry import level_rotation, transform
 from vislam.core.messages import Array, ImuSpan, NavState, Observations, Tracking, VoMeasurement
 from vislam.frontend.start.answer import WINDOW_S, Initialisation, moving
-from vislam.frontend.start.from_tracks import Sighted, StartFromTracks
+from vislam.frontend.start.from_tracks import VO_INFLATION, Sighted, StartFromTracks
 from vislam.frontend.start.inertial_alignment import VisualMotion, Window, excitation, refine, solve_linear
 from vislam.frontend.start.refusals import Refusals
 from vislam.frontend.start.solution import from_alignment
 from vislam.frontend.start.views import Entry, FrameWindow, metric_motions
 from vislam.imu import ImuNoise, RestDetector, join
-from vislam.imu.resting import rest_accel_bias, rest_covariance
+from vislam.imu.resting import GRAVITY_TOLERANCE_M_S2, rest_accel_bias, rest_covariance
 
-# of the measured norm: accelerometer bias and scale of a calibrated sensor
-_GRAVITY_TOLERANCE_M_S2 = 0.5
 _WINDOW_MIN_S = 1.0  # try from here on
 _MONO_WINDOW_MIN_S = 1.0
 _NODE_SPACING_S = 0.1  # frames closer than this add noise and cost, not knowledge
-_VO_INFLATION = 1.5  # on the sigmas of relative motion, which share the keyframe's landmark errors
 _ATTEMPT_S = 0.3  # between attempts: one costs up to 0.1 s, and a window changes little in this time
 _MAX_NODES = 45  # bounds the cost of one attempt (dense, cubic); longer windows get wider spacing
 _MONO_MAX_NODES = 20  # the same without scale, where every node also carries its sightings of points
@@ -196,7 +193,7 @@ class Initialiser:
         span = join(spans)
         gyro, force = span.gyro_rad_s.mean(axis=0), span.accel_m_s2.mean(axis=0)
         norm = float(np.linalg.norm(force))
-        if abs(norm - self._gravity) > _GRAVITY_TOLERANCE_M_S2:
+        if abs(norm - self._gravity) > GRAVITY_TOLERANCE_M_S2:
             return self._refusals.contradiction(norm)
         T_odom_vo = transform(level_rotation(entries[-1].T_vo_body[:3, :3] @ force), np.zeros(3))
         poses = np.array([T_odom_vo @ entry.T_vo_body for entry in entries])
@@ -228,7 +225,7 @@ class Initialiser:
             reason = f"camera clock known to {1e3 * sigma_s:.1f} ms of {limit_ms:.1f}; turn"
             return refusals.refuse("time offset", reason)
         chosen = self._window.choose_nodes(_NODE_SPACING_S, _MAX_NODES)
-        window = self._inertial_window(chosen, metric_motions(chosen, _VO_INFLATION))
+        window = self._inertial_window(chosen, metric_motions(chosen, VO_INFLATION))
         linear = solve_linear(window)
         norm = float(np.linalg.norm(linear.gravity_m_s2))
         refusal = refusals.gravity(norm, linear.gravity_norm_sigma_m_s2)

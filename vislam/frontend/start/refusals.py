@@ -8,8 +8,11 @@ from vislam.config import InitConfig
 from vislam.frontend.start.answer import Initialisation
 from vislam.frontend.start.closed_form import InertialPath, Start, Tracks, median_parallax
 from vislam.frontend.start.solution import Solution
+from vislam.imu.resting import GRAVITY_TOLERANCE_M_S2
 from vislam.window.bundle import BundleSolution
 
+_MIN_POINTS = 10  # monocular: two numbers a sighting leave some redundancy; how much, the sigmas say
+MIN_PARALLAX_PX = 12.0  # monocular: median over the points; below, depth and so scale drown in noise
 _MAX_TILT_SIGMA_DEG = 2.0  # 0.2 m/s^2 of unknown accelerometer bias alone is 1.2 deg
 _MAX_VELOCITY_SIGMA_M_S = 0.2
 _MAX_GYRO_BIAS_SIGMA_RAD_S = 0.02
@@ -48,7 +51,7 @@ class Refusals:
 
     def gravity(self, norm: float, sigma: float) -> Initialisation | None:
         """Refuse a norm of gravity that is not known well enough, or is not that of gravity."""
-        allowed = self._config.gravity_tolerance_m_s2
+        allowed = GRAVITY_TOLERANCE_M_S2
         if sigma > 2.0 * allowed:
             reason = f"gravity norm {norm:.1f} +- {sigma:.1f} m/s2: too little acceleration or turning"
             return self.refuse("gravity", reason)
@@ -59,11 +62,11 @@ class Refusals:
     def sight(self, tracks: Tracks, path: InertialPath, fx: float) -> Initialisation | None:
         """Refuse a window in which there is too little to see."""
         config = self._config
-        if tracks.points < config.min_points:
-            return self.refuse("points", f"{tracks.points} points of {config.min_points} needed followed long enough")
+        if tracks.points < _MIN_POINTS:
+            return self.refuse("points", f"{tracks.points} points of {_MIN_POINTS} needed followed long enough")
         parallax_px = median_parallax(tracks, path.rotations) * fx
-        if parallax_px < config.min_parallax_px:
-            return self.refuse("parallax", f"parallax {parallax_px:.0f} px of {config.min_parallax_px:.0f} needed")
+        if parallax_px < MIN_PARALLAX_PX:
+            return self.refuse("parallax", f"parallax {parallax_px:.0f} px of {MIN_PARALLAX_PX:.0f} needed")
         if path.excitation_m_s2 < config.min_excitation_m_s2:
             return self.refuse(
                 "excitation",
@@ -75,7 +78,7 @@ class Refusals:
     def start(self, start: Start) -> Initialisation | None:
         """Refuse where the linear solution, gravity left free, is far from what gravity can be."""
         # in a short window this norm errs by more than its sigma says: twice the room
-        allowed = 2.0 * (self._config.gravity_tolerance_m_s2 + AGREE_SIGMAS * start.free_norm_sigma_m_s2)
+        allowed = 2.0 * (GRAVITY_TOLERANCE_M_S2 + AGREE_SIGMAS * start.free_norm_sigma_m_s2)
         is_foreign = abs(start.free_norm_m_s2 - self._gravity) > allowed
         return self.contradiction(start.free_norm_m_s2) if is_foreign else None
 
