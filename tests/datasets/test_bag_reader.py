@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -170,17 +172,14 @@ def test_the_noise_may_stand_beside_the_bag(tmp_path: Path) -> None:
         open_dataset(str(file))
 
 
-def test_the_extra_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vislam.datasets.bags import surveying
-
+def test_the_extra_is_named_where_it_is_missing(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", images_of(types_of("mcap")))
-
-    def missing() -> None:
-        raise DataError("bags need rosbags; install it: pip install 'vislam[bags]'")
-
-    monkeypatch.setattr(surveying, "need_rosbags", missing)
-    with pytest.raises(DataError, match=r"pip install 'vislam\[bags\]'"):
-        open_dataset(str(path))
+    script = (
+        "import sys; sys.modules['rosbags'] = None\nfrom vislam.datasets import open_dataset; open_dataset(sys.argv[1])"
+    )
+    done = subprocess.run([sys.executable, "-c", script, path], capture_output=True, text=True, check=False)
+    assert "DataError: bags need rosbags" in done.stderr
+    assert "pip install '.[bags]'" in done.stderr
 
 
 def pixels_of(shape: tuple[int, ...], dtype: type, top: int) -> np.ndarray:

@@ -169,5 +169,5 @@ def test_a_cluster_that_is_not_there_is_one_line(specs, tmp_path, monkeypatch):
     with pytest.raises(UsageError, match="no Dask scheduler answers at 'tcp://127"):
         list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"pip install 'vislam\[cluster\]'"):
+    with pytest.raises(UsageError, match=r"pip install '\.\[cluster\]'"):
         list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))

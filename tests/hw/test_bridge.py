@@ -378,7 +378,7 @@ def test_a_port_without_permission_says_which_group(config: SerialConfig) -> Non
 
 def test_without_pyserial_it_says_what_to_install(config: SerialConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "serial", None)
-    with pytest.raises(HardwareError, match=r"vislam\[hw\]"):
+    with pytest.raises(HardwareError, match=r"pip install '\.\[hw\]'"):
         SerialBridge(config)
 
 

@@ -128,7 +128,7 @@ def test_the_kernel_driver_of_an_address_is_found(tmp_path) -> None:
 def test_smbus2_is_asked_for_when_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("smbus2", "smbus2.smbus2"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(HardwareError, match=r"vislam\[hw\]"):
+    with pytest.raises(HardwareError, match=r"pip install '\.\[hw\]'"):
         I2cBus("/dev/i2c-1", 0.02)
 
 

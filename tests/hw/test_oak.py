@@ -129,7 +129,7 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(HardwareError, match="needs depthai 3"):
         open_frame_camera("oak", SENSORS)
     monkeypatch.setitem(sys.modules, "depthai", None)
-    with pytest.raises(HardwareError, match=r"pip install 'vislam\[oak\]'"):
+    with pytest.raises(HardwareError, match=r"pip install '\.\[oak\]'"):
         open_frame_camera("oak", SENSORS, must_be_there=False)
 
 

@@ -138,7 +138,7 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(HardwareError, match="give its number, as picam:0"):
         open_camera("picam:front", config)
     monkeypatch.setitem(sys.modules, "picamera2", None)
-    with pytest.raises(HardwareError, match=r"pip install 'vislam\[pi\]'"):
+    with pytest.raises(HardwareError, match=r"pip install '\.\[pi\]'"):
         open_camera("picam", config, must_be_there=False)
     assert is_library_camera("picam:1")
     assert not is_video("picam:1")

@@ -39,13 +39,13 @@ needs_mavlink = pytest.mark.usefixtures("mavlink")
 @pytest.fixture
 def dds() -> None:
     if importlib.util.find_spec("cyclonedds") is None:
-        missing("cyclonedds is not installed: pip install 'vislam[ros2]'")
+        missing("cyclonedds is not installed: pip install '.[ros2]'")
 
 
 @pytest.fixture
 def mavlink() -> None:
     if importlib.util.find_spec("pymavlink") is None:
-        missing("pymavlink is not installed: pip install 'vislam[mavlink]'")
+        missing("pymavlink is not installed: pip install '.[mavlink]'")
 
 
 def known_pose(**changes: object):
@@ -366,7 +366,7 @@ def test_a_missing_package_is_named_with_what_installs_it(
     live: LiveConfig, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(translator, "find_spec", lambda package: None)
-    with pytest.raises(UsageError, match=rf"pip install 'vislam\[{extra}\]'"):
+    with pytest.raises(UsageError, match=rf"pip install '\.\[{extra}\]'"):
         translator.asked(live)
 
 

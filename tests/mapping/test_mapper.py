@@ -440,7 +440,7 @@ def test_an_unusable_folder_is_a_storage_error(tmp_path):
 
 def test_mesh_of_the_room(tmp_path):
     if _open3d.load_open3d()[0] is None:
-        missing("no open3d; pip install 'vislam[map]'")
+        missing("no open3d; pip install '.[map]'")
     contents = []
     for name in ("a", "b"):
         mapper = mapper_at(TRUE, replace(CONFIG, products=("mesh",), mesh_voxel_m=0.04, pixel_step=1))
@@ -457,7 +457,7 @@ def test_mesh_of_the_room(tmp_path):
 
 def test_what_one_keyframe_saw_is_in_the_mesh_unless_later_rays_passed_through_it():
     if _open3d.load_open3d()[0] is None:
-        missing("no open3d; pip install 'vislam[map]'")
+        missing("no open3d; pip install '.[map]'")
     depth_m = depth_image(TRUE[0])
     depth_m[40:80, 60:100] = 1.0  # a board that is gone in later keyframes
     config = replace(CONFIG, products=("mesh",), mesh_voxel_m=0.04, pixel_step=1)
