@@ -38,8 +38,6 @@ class PowerUpConfig:
     """Taking the current attitude as horizontal and the current rate as zero, when the power comes on."""
 
     window_s: NonNegative = 2.0  # of standing still; a gyro of 0.03 deg/s/sqrt(Hz) gives its bias to 0.02 deg/s
-    max_gyro_std_rad_s: NonNegative = 0.02  # per axis; an ITG3205 at 98 Hz has 0.0065, a hand on the cart gives 0.03
-    max_accel_std_m_s2: NonNegative = 0.25  # per axis; an ADXL345 at 400 Hz has 0.08
     max_rate_rad_s: NonNegative = 0.7  # mean; the ITG3205 may start with 40 deg/s, more is motion
     max_tilt_deg: NonNegative = 20.0  # of the body to gravity; more is a wrong axis, or no cart that stands on a floor
     memory: str | None = None  # file of the biases found, by temperature; one for each board. None: forget them

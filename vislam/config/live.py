@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability, Range, Share
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability, Range
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,6 @@ class LiveConfig:
     vision_timeout_s: NonNegative = 0.3
     drift_sigma_m: NonNegative = 0.3  # position sigma gained since vision was lost, above which the pose is invalid
     velocity_sigma_m_s: NonNegative = 0.5  # above which it is invalid
-    heartbeat_s: NonNegative = 0.05  # between poses while there are no samples, so that a reader sees why
     event_s: NonNegative = 0.5  # so long a passing sensor event stays in the health word
     keyframe_queue: Count = 8  # keyframes that may wait for the back end; when half of that wait, fewer are made
     map_age_s: Positive = 2.0  # older frames make the map take fewer keyframes: it would fall behind without end
@@ -50,4 +49,3 @@ class VerdictConfig:
     # of the camera on the body as told: Kalibr is good to 0.1, a printed mount to 1
     rotation_sigma_deg: NonNegative = 0.5
     accel_bias_sigma_m_s2: NonNegative = 0.2  # as `init.accel_bias_sigma_m_s2`: of a calibrated cheap accelerometer
-    min_coverage: Share = 0.5  # of the frames that must have a pose; below, the run is lost

@@ -35,7 +35,6 @@ class MonoDepthConfig:
     step_px: Positive = 0.7  # along the epipolar line; patches of 7 px change little over that
     reach_px: Positive = 100.0  # searched to both sides of where a pixel is expected; bounds its time
     search_sigmas: NonNegative = 3.0  # of inverse depth, to both sides
-    least_score: Finite | None = None  # of a match; None: the measure's own, see mapping/monodepth/matching.py
     uniqueness: Share = 0.8  # most that the best match's cost may be of the next one's; 1 asks for nothing
     sigma_px: Positive = 1.0  # of a match along the epipolar line
     # of a match, where noise and gradient tell the rest of its error (SVO, REMODE): what poses and lens leave; None: a
@@ -95,7 +94,6 @@ class MapConfig:
     move_deg: NonNegative = 1.0  # or turned by more than this: 7 cm at 4 m
     rebuild_keyframes_per_call: Whole = 8  # that cast rays again in one call while a correction is followed; 3 ms each
     cloud_voxel_m: Positive = 0.015  # one averaged point per voxel in cloud.ply
-    cloud_max_points: Count = 1_500_000  # a larger cloud gets larger voxels: 22 MB
     cloud_min_points: Whole = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
     cloud_neighbours: Whole = 12  # statistical outlier removal: mean distance to so many neighbours
     cloud_outlier_sigma: NonNegative = 2.5  # may exceed the average by so many standard deviations

@@ -89,11 +89,6 @@ class FastPath:
         """What came to the filter and what became of it."""
         return self._ekf.counters
 
-    @property
-    def heartbeat_s(self) -> float:
-        """How often to publish while there are no samples."""
-        return self._config.live.heartbeat_s
-
     def status(self) -> dict[str, Any]:
         """Return what a person wants to see of the newest pose."""
         pose = self._newest

@@ -36,6 +36,7 @@ from vislam.mapping.upright import View, view_of
 
 _RIGID_TOLERANCE = 1e-4
 _MAX_COLOURED_VOXELS = 1 << 22  # of the octree; more, and neighbours share a colour
+_MOST_CLOUD_POINTS = 1_500_000  # a larger cloud gets larger voxels: 22 MB
 _MOST_VIEWS = 200  # keyframes that are asked for the directions of surfaces; 10 ms each
 
 
@@ -162,7 +163,7 @@ class Mapper:
         """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
         config = self._config
         average, sparse_only = _averaged(
-            self._scans(), self._extractor.view, config.min_range_m, config.cloud_voxel_m, config.cloud_max_points
+            self._scans(), self._extractor.view, config.min_range_m, config.cloud_voxel_m, _MOST_CLOUD_POINTS
         )
         fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
         # what later rays passed through was a moving thing or a false match

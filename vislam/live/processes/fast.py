@@ -30,6 +30,7 @@ from vislam.sensors import Suite
 _NS = 1_000_000_000
 _READ_S = 0.005  # most that reading waits: messages of vision are looked for in between
 _NOTE_S = 0.5
+_HEARTBEAT_NS = 50_000_000  # between poses while there are no samples, so that a reader sees why
 _BIN_NS = 5_000  # of the histogram of latencies
 _BINS = 40_000  # up to 0.2 s; what is longer counts into the last
 _PARTS = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
@@ -91,7 +92,7 @@ def _loop(
     gc.collect()
     gc.freeze()
     gc.disable()  # nothing here makes cycles, and a collection would cost the pose a millisecond
-    heartbeat_ns, published_ns, noted_ns = round(fast.heartbeat_s * _NS), 0, 0
+    published_ns, noted_ns = 0, 0
     while not life.stopped:
         values = source.read(_READ_S)
         for value in values:
@@ -107,7 +108,7 @@ def _loop(
             sender.flush()
         inbox.take(fast.correct)
         now_ns = time.monotonic_ns()
-        if now_ns - published_ns > heartbeat_ns:
+        if now_ns - published_ns > _HEARTBEAT_NS:
             published_ns = now_ns
             fast.publish(now_ns, source.health)
         if now_ns - noted_ns > _NOTE_S * _NS:

@@ -21,6 +21,7 @@ _FORCE_SCALE_SIGMA = 0.01  # relative, of accelerometer and of baseline or depth
 _GYRO_NOISE_DEG = 1.0  # after a second
 _ACCEL_NOISE_M_S = 0.3  # after a second
 _RATE_ERROR = 0.2  # relative, of the inertial rate against that stated: clocks are good to 3 %
+_MIN_COVERAGE = 0.5  # of the frames that must have a pose; below, the run is lost
 _LOST_SHARE = 0.1  # of the frames that vision may lose: it finds its keyframe again, and nothing drifted ...
 _LOST_S = 1.0  # ... but not after so long: a cheap IMU alone is off by a centimetre to a decimetre then
 _DEGRADED_SHARE = 0.2  # of the frames on which vision may lean weakly
@@ -107,8 +108,8 @@ def _misses_samples(e: Evidence) -> bool:
     return e.samples_missed > _MISSING_SHARE * (e.samples + e.samples_missed)
 
 
-def _lost(e: Evidence, c: VerdictConfig) -> Iterator[str]:
-    if e.frames and e.coverage < c.min_coverage:
+def _lost(e: Evidence, _: VerdictConfig) -> Iterator[str]:
+    if e.frames and e.coverage < _MIN_COVERAGE:
         yield f"only {e.coverage:.0%} of the frames have a pose ({e.start_reason or 'vision was lost'})"
 
 

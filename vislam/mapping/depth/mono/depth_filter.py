@@ -143,9 +143,9 @@ class DepthFilter:
 
 def rules(config: MonoDepthConfig, noise: float) -> Rules:
     """Return the settings as compiled code takes them; `noise` is that of a pixel in grey levels."""
-    least = LEAST_SCORE[config.measure] if config.least_score is None else config.least_score
     return Rules(
-        CODES[config.measure], config.fusion == "beta", config.step_px, config.reach_px, config.search_sigmas, least,
+        CODES[config.measure], config.fusion == "beta", config.step_px, config.reach_px, config.search_sigmas,
+        LEAST_SCORE[config.measure],
         config.uniqueness, config.sigma_px, config.min_gradient, config.max_sigma_ratio, config.converged,
         config.min_matches, config.max_misses, _MIN_GOOD, 1.0 / config.max_depth_m, 1.0 / config.min_depth_m,
         -1.0 if config.model_sigma_px is None else config.model_sigma_px, noise,
