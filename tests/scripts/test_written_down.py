@@ -251,8 +251,9 @@ def free_names(tree: ast.Module) -> set[str]:
     return {node.id for node in names} - made
 
 
-def with_inputs(text: str, inputs: dict[str, Path]) -> str:
-    """Return a snippet with the recordings and runs of these tests in place of the reader's."""
+def with_inputs(text: str, inputs: dict[str, Path], out: Path) -> str:
+    """Return a snippet with the recordings and runs of these tests in place of the reader's; new runs go to `out`."""
+    text = re.sub(r'\bout="[^"]*"', lambda _: f"out={str(out)!r}", text)
     return re.sub("|".join(QUOTED), lambda quoted: str(inputs[QUOTED[quoted[0]]]), text)
 
 
@@ -262,11 +263,11 @@ def test_the_snippets_of_a_page_run(
 ) -> None:
     """Whole ones run, on the recording, run and graph of these tests; of parts the imports do."""
     monkeypatch.chdir(tmp_path)
-    for where, text in blocks(page, ("python",)):
+    for number, (where, text) in enumerate(blocks(page, ("python",))):
         tree = ast.parse(text, where)
         imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
         if imports and not free_names(tree):
             inputs = request.getfixturevalue("inputs")
-            exec(compile(with_inputs(text, inputs), where, "exec"), {"__name__": "snippet"})
+            exec(compile(with_inputs(text, inputs, tmp_path / f"out{number}"), where, "exec"), {"__name__": "snippet"})
         else:
             exec(compile(ast.Module(imports, []), where, "exec"), {})
