@@ -101,6 +101,12 @@ def test_a_run_leaves_the_documented_folder(small_room, finished):
     assert read_run(finished).unread == {}
 
 
+def test_a_dry_run_prints_what_the_run_writes_down(recorded, finished, tmp_path, capsys):
+    assert run_verb(["run", str(recorded), "--out", str(tmp_path / "new"), "--view.enabled", "--dry-run"]) == 0
+    assert json.loads(capsys.readouterr().out)["config"] == json.loads((finished / "config.json").read_text())
+    assert not (tmp_path / "new").exists()
+
+
 def test_replay_in_a_fresh_process_gives_identical_bytes(recorded, finished, tmp_path):
     """As in one that has run other things before, and shows the run."""
     command = [sys.executable, "-m", "vislam", "run", str(recorded), "--out", str(tmp_path / "again")]

@@ -12,8 +12,9 @@ from vislam.core.errors import VislamError
 from vislam.core.log import log_to
 from vislam.core.up import parse_up
 from vislam.datasets.calibrated import with_clock
+from vislam.pipeline.settings import derived
 from vislam.runs.begin import execute
-from vislam.runs.drive import Progress
+from vislam.runs.drive import Progress, imu_noise
 from vislam.runs.folder import map_choice, prepare
 from vislam.runs.loaded import LoadedRun, load_run
 from vislam.runs.sources import open_source
@@ -64,6 +65,14 @@ def run_source(
     prepare(out, overwrite, choice)
     with written_up(out, command), show(recording.name) as progress:
         return execute(recording, config, out, source, command, progress, choice)
+
+
+def resolved(source: str, config: Config) -> Config:
+    """Return what config.json of a run of this source would hold: the settings, and what follows from its sensors."""
+    parse_up(config.up)
+    config = with_clock(config)
+    recording = open_source(source, config.seed, config.calibration)
+    return derived(config, recording.rig, imu_noise(config.imu, recording.imu_noise))
 
 
 @contextmanager

@@ -36,7 +36,7 @@ class RunOptions:
     localize_only: bool = False
     """With --map: find the way in it, and leave its keyframes and clouds as they are"""
     dry_run: bool = False
-    """Only print the resolved configuration as JSON"""
+    """Only print, as JSON, the configuration that config.json would hold"""
     json: bool = False
     """Print the metrics as JSON instead of the table"""
 
@@ -79,7 +79,10 @@ def main(arguments: list[str]) -> int:
     base = RunOptions(source=tyro.MISSING, out=tyro.MISSING, settings=settings)
     options = parse(RunOptions, arguments, "run", base, BRIEF)
     if options.dry_run:
-        print(json.dumps({"source": options.source, "out": str(options.out), "config": dump(options.settings)}))
+        from vislam.runs.run import resolved
+
+        config = dump(resolved(options.source, options.settings))
+        print(json.dumps({"source": options.source, "out": str(options.out), "config": config}))
         return 0
     print_metrics(run_options(options, command), options.out, options.json)
     return 0
