@@ -67,7 +67,7 @@ def write(path: Path, keyframes: int, features: int) -> Keyframe:
     places = rng.integers(0, 256, (LAP, features, 32), np.uint8)
     info = {"config": {}, "source": "synthetic"}
     with_words = 3 * keyframes // 4  # the next training is not due while it is measured
-    writer = SessionWriter(path, info, RIG, None, 9.81)
+    writer = SessionWriter.create(path, info, RIG, None, 9.81)
     seen = []
     for k in range(keyframes):
         keyframe = keyframe_of(k, features, rng, places)

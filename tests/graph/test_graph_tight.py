@@ -561,7 +561,7 @@ def test_a_restored_graph_has_no_more_in_its_solver(make, tmp_path, monkeypatch:
     watched = WatchedSolvers(monkeypatch)
     config = replace(TIGHT, loop_gain_min=0.0, freeze_keyframes=20, freeze_after=40)
     old, _ = make(world, config=config)
-    writer = SessionWriter(tmp_path / "session.db", {}, RIG, world.noise, GRAVITY_M_S2)
+    writer = SessionWriter.create(tmp_path / "session.db", {}, RIG, world.noise, GRAVITY_M_S2)
     for k in range(world.count):
         edges = [world.loop(k, k - 100, k)] if k >= 100 else []
         start = start_facts(world.initial_state(), world.noise) if k == 0 else None

@@ -181,7 +181,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     world: LandmarkWorld = room(1)
     rng, poses = np.random.default_rng(0), lap_poses(2.0, PER_LAP)
     detector = LoopCloser(replace(LoopConfig(), appearance_skip_keyframes=12, appearance_skip_s=1.0), world.rig, 0)
-    writer = SessionWriter(folder / "session.db", {"source": "test"}, world.rig, None, 9.81)
+    writer = SessionWriter.create(folder / "session.db", {"source": "test"}, world.rig, None, 9.81)
     rows: list[LoopRow] = []
     retrieved: list[RetrievedKeyframe] = []
     for k, pose in enumerate(poses):

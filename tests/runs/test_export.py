@@ -43,7 +43,7 @@ def run(tmp_path_factory):
     write_ply(folder / "map" / "cloud.ply", points(), COLORS)
     write_grid(folder / "map", GRID)
     write_grid(folder / "map", Grid(1 - np.abs(CELLS), 0.1, (0.0, 0.0), 0.0), "drive")
-    SessionWriter(folder / "session.db", {"config": {}}, RIG, None, 9.81).close(finished=True)
+    SessionWriter.create(folder / "session.db", {"config": {}}, RIG, None, 9.81).close(finished=True)
     return folder
 
 

@@ -31,7 +31,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, World]:
     run = tmp_path_factory.mktemp("loops") / "run"
     run.mkdir()
     world = World(28.0, seed=6, vo_sigma_rad=np.deg2rad(0.4), vo_sigma_m=0.01)
-    writer = SessionWriter(run / "session.db", {"config": asdict(Config(graph=GRAPH))}, RIG, None, GRAVITY_M_S2)
+    writer = SessionWriter.create(run / "session.db", {"config": asdict(Config(graph=GRAPH))}, RIG, None, GRAVITY_M_S2)
     graph = PoseGraph(GRAPH, None, MACHINE, RIG, WindowConfig())
     graph.initialise(None, world.truth[0])
     for k in range(world.count):

@@ -140,7 +140,7 @@ def add_map_and_session(run):
     rng = np.random.default_rng(3)
     points = rng.uniform(-5.0, 5.0, (3000, 3)).astype(np.float32)
     write_ply(run / "map" / "cloud.ply", points, rng.integers(0, 255, (3000, 3), dtype=np.uint8))
-    writer = SessionWriter(run / "session.db", {"config": {}}, RIG, world.noise, GRAVITY_M_S2)
+    writer = SessionWriter.create(run / "session.db", {"config": {}}, RIG, world.noise, GRAVITY_M_S2)
     for k in range(2):
         colors = cv2.imencode(".png", rng.integers(0, 255, (60, 80, 3), dtype=np.uint8))[1].tobytes()
         scan = PackedScan(k, cv2.imencode(".png", np.full((60, 80), 1000, np.uint16))[1].tobytes(), b"", colors)

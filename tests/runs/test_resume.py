@@ -80,7 +80,7 @@ def same(a: object, b: object) -> bool:
 def test_a_graph_is_built_again_exactly_and_ends_where_it_would_have(config, imu, tmp_path, monkeypatch):
     world = World(36.0, seed=5)
     measured = [(world.packet(k, imu=imu, lost=k == 60), edges_of(world, k)) for k in range(world.count)]
-    writer = SessionWriter(tmp_path / "session.db", {}, RIG, world.noise if imu else None, GRAVITY_M_S2)
+    writer = SessionWriter.create(tmp_path / "session.db", {}, RIG, world.noise if imu else None, GRAVITY_M_S2)
     old = make_graph(world, config, imu, monkeypatch)
     feed(old, world, measured[:150], writer)
     writer.close()
@@ -111,7 +111,7 @@ def test_a_graph_is_built_again_exactly_and_ends_where_it_would_have(config, imu
 def test_the_newest_state_of_the_window_is_that_of_the_last_commit(tmp_path, monkeypatch):
     world = World(10.0, seed=6)
     measured = [(world.packet(k), []) for k in range(40)]
-    writer = SessionWriter(tmp_path / "session.db", {}, RIG, world.noise, GRAVITY_M_S2)
+    writer = SessionWriter.create(tmp_path / "session.db", {}, RIG, world.noise, GRAVITY_M_S2)
     graph = make_graph(world, TIGHT, True, monkeypatch)
     feed(graph, world, measured, writer)
     writer.close()
@@ -264,7 +264,7 @@ def test_a_run_that_had_not_begun_begins_again(copied, left, capsys):
         sqlite3.connect(copied / "session.db").execute("PRAGMA journal_mode=WAL")
     if left == "no keyframe":
         recording, config = open_source(SOURCE), json.loads((copied / "config.json").read_text())
-        SessionWriter(copied / "session.db", {"config": config}, recording.rig, recording.imu_noise, 9.81)
+        SessionWriter.create(copied / "session.db", {"config": config}, recording.rig, recording.imu_noise, 9.81)
     assert run_verb(["run", "--resume", str(copied), "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["resumed"] == []

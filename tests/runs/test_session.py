@@ -83,7 +83,7 @@ def record(accepted=(), rejected=()):
 
 def write_three(path, count=3):
     rng = np.random.default_rng(SEED)
-    writer = SessionWriter(path, {"source": "test", "config": {"seed": 1}}, RIG, NOISE, 9.80665)
+    writer = SessionWriter.create(path, {"source": "test", "config": {"seed": 1}}, RIG, NOISE, 9.80665)
     poses = [se3_exp(rng.normal(size=6)) for _ in range(3)]
     packets = [packet(i, rng) for i in range(3)]
     edge = LoopEdge(5, 0, 2, poses[1], np.eye(6) * 0.01, True, 40, 0.3)
@@ -209,7 +209,7 @@ def test_a_session_killed_at_any_moment_of_its_beginning_or_end_can_be_read(tmp_
         if child == 0:
             for _ in range(100):
                 path.unlink(missing_ok=True)
-                SessionWriter(path, {"source": "none"}, RIG, None, 9.81).close(finished=True)
+                SessionWriter.create(path, {"source": "none"}, RIG, None, 9.81).close(finished=True)
             os._exit(0)
         time.sleep(rng.uniform(0.0, 0.02))
         os.kill(child, signal.SIGKILL)
@@ -329,7 +329,7 @@ def test_a_session_of_the_first_format_is_refused_with_the_next_step(tmp_path):
 def test_noise_under_the_names_before_those_of_kalibr_is_read(tmp_path):
     writer, *_ = write_three(tmp_path / "session.db")
     old = {"gyro_noise_density": 1.7e-4, "accel_noise_density": 2.0e-3, "gyro_bias_walk": 1.9393e-5}
-    writer.tell({"imu_noise": old | {"accel_bias_walk": 3.0e-3, "rate_hz": 200.0, "gyro_scale_sigma": None}})
+    writer.set_info({"imu_noise": old | {"accel_bias_walk": 3.0e-3, "rate_hz": 200.0, "gyro_scale_sigma": None}})
     writer.close()
     with closing(Session(tmp_path / "session.db")) as session:
         assert session.factor_log().noise == NOISE
@@ -337,4 +337,4 @@ def test_noise_under_the_names_before_those_of_kalibr_is_read(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_a_storage_error(tmp_path):
     with pytest.raises(StorageError, match="cannot be written"):
-        SessionWriter(tmp_path / "absent" / "session.db", {}, RIG, None, 9.81)
+        SessionWriter.create(tmp_path / "absent" / "session.db", {}, RIG, None, 9.81)

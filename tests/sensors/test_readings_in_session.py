@@ -62,7 +62,7 @@ def feed(graph: PoseGraph, world: World, packets: list[KeyframePacket], writer: 
 
 
 def stored(path: Path, world: World, config: GraphConfig = LOOSE, imu: bool = True, end: int = 40) -> PoseGraph:
-    writer = SessionWriter(path, {}, RIG, world.noise if imu else None, GRAVITY_M_S2)
+    writer = SessionWriter.create(path, {}, RIG, world.noise if imu else None, GRAVITY_M_S2)
     graph = graph_of(world, config, imu, Suite(SENSORS))
     feed(graph, world, packets_of(world, imu)[:end], writer)
     writer.close()
@@ -137,7 +137,7 @@ def without_readings(path: Path) -> None:
 
 def test_a_session_of_the_format_before_is_read_and_gone_on_with(tmp_path) -> None:
     world, path = World(4.0, seed=4), tmp_path / "session.db"
-    writer = SessionWriter(path, {}, RIG, world.noise, GRAVITY_M_S2)
+    writer = SessionWriter.create(path, {}, RIG, world.noise, GRAVITY_M_S2)
     packets = [world.packet(k) for k in range(world.count)]
     graph = graph_of(world, LOOSE, True, None)
     feed(graph, world, packets[:10], writer)

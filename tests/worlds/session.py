@@ -179,7 +179,7 @@ class _Eyes:
 
 def store(log: FactorLog, path: Path, info: dict | None = None, upto: int | None = None) -> SessionWriter:
     """Write a log as the session of a run; the caller closes it, or does not."""
-    writer = SessionWriter(path, info or {"config": {}}, log.rig, log.noise, log.gravity_m_s2)
+    writer = SessionWriter.create(path, info or {"config": {}}, log.rig, log.noise, log.gravity_m_s2)
     for k, keyframe in enumerate(log.keyframes[:upto]):
         packet: KeyframePacket = keyframe.packet
         writer.add_frame(FrameEntry(packet.keyframe.t_ns, k, np.eye(4)))

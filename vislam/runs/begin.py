@@ -103,7 +103,7 @@ def begun(
     make = make or partial(Run, recording, config, out)
     if base is None:
         write_setup(out, config, source, command)
-        return make(SessionWriter(path, info, recording.rig, noise, config.machine.gravity_m_s2))
+        return make(SessionWriter.create(path, info, recording.rig, noise, config.machine.gravity_m_s2))
     stored = Session(base.session)
     try:
         memory = map_of(stored, recording, config, noise, base.localize_only)

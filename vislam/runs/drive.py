@@ -131,7 +131,7 @@ class Run:
         t_s = (front.t_ns - int(self.log.stamps_ns[0])) * 1e-9
         now = datetime.now(UTC).isoformat(timespec="seconds")
         self.resumed = [*info.get("resumed", []), {"keyframe": front.keyframe_id, "t_s": t_s, "utc": now}]
-        self.session.tell({"resumed": self.resumed, "finished": False})
+        self.session.set_info({"resumed": self.resumed, "finished": False})
         self.session.move(update, GraphRecord())
         self.warnings.append(
             f"resumed {len(self.resumed)} times, last at keyframe {front.keyframe_id}: timings, counters and "
@@ -267,11 +267,11 @@ class Run:
                 write_pictures(level_map, self.out / "map", level_path.positions_m, level.is_level)
         metrics = self._metrics(level_path, truth, wall_s, loops)
         if up := level.entry(final, self.recording.rig):
-            self.session.tell(up)
+            self.session.set_info(up)
             metrics |= up
         estimates = {"filter": self.log.odometry_trajectory(), "graph": final}
         if (datum := self._geodetic.write(self.out, metrics["sensors"], estimates)) is not None:
-            self.session.tell({"datum": datum})
+            self.session.set_info({"datum": datum})
         write_json(self.out / "metrics.json", metrics)
         for warning in metrics["warnings"]:
             _LOG.warning("%s", warning)

@@ -49,19 +49,30 @@ from vislam.runs.session.schema import (
 class SessionWriter:
     """Owns a session file while a run writes it."""
 
-    def __init__(self, path: Path, info: dict[str, Any], rig: Rig, noise: ImuNoise | None, gravity_m_s2: float) -> None:
+    def __init__(self, path: Path, db: sqlite3.Connection) -> None:
+        """Write through an open database; `create`, `reopen` and `in_map` return a writer, `amend` uses one."""
+        self.path, self._db = path, db
+        self._frames: list[FrameEntry] = []
+        self._edges = 0
+        self._first_id = 0  # of the keyframes of this recording
+
+    @classmethod
+    def create(
+        cls, path: Path, info: dict[str, Any], rig: Rig, noise: ImuNoise | None, gravity_m_s2: float
+    ) -> SessionWriter:
         """Create the file; `info` (config, source) is stored as JSON. Raises StorageError when it cannot be.
 
         `noise` is None where there is no IMU.
         """
-        self._open(path)
+        writer = cls(path, _opened(path))
         sensors = {"rig": rig_data(rig), "imu_noise": None if noise is None else asdict(noise)}
-        with storage(path), self._transaction():  # half of the tables would be a file that cannot be opened again
-            self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
+        with storage(path), writer._transaction():  # half of the tables would be a file that cannot be opened again
+            writer._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
             for statement in schema(SCHEMA_VERSION).split(";"):
-                self._db.execute(statement)
-            self._tell({**info, **sensors, "gravity_m_s2": gravity_m_s2, "finished": False})
-            self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+                writer._db.execute(statement)
+            writer._set_info({**info, **sensors, "gravity_m_s2": gravity_m_s2, "finished": False})
+            writer._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+        return writer
 
     @classmethod
     def reopen(cls, path: Path) -> SessionWriter:
@@ -71,7 +82,6 @@ class SessionWriter:
         """
         if not path.is_file():
             raise DataError(f"no session at {path}; a run leaves one as session.db")
-        writer = cls.__new__(cls)
         with readable(path):
             probe = connect(path)  # what a write-ahead log holds is taken in
         try:
@@ -79,9 +89,8 @@ class SessionWriter:
             check_records(probe, path)
         finally:
             probe.close()
-        writer._open(path)
+        writer = cls(path, db := _opened(path))
         with storage(path), writer._transaction():
-            db = writer._db
             writer._bring_up()
             newest_id, newest_t_ns = db.execute("SELECT id, t_ns FROM keyframes ORDER BY id DESC").fetchone() or (-1, 0)
             db.execute("DELETE FROM frames WHERE t_ns > ? OR keyframe_id > ?", (newest_t_ns, newest_id))
@@ -101,23 +110,22 @@ class SessionWriter:
         Raises StorageError when it cannot be written.
         """
         part = path.with_name(path.name + ".part")  # the file appears whole or not at all
-        writer = cls.__new__(cls)
         with storage(path):
             part.unlink(missing_ok=True)
-            writer._db = connect(part, isolation_level=None)
-            base.copy_to(writer._db)
+            writer = cls(part, db := connect(part, isolation_level=None))
+            base.copy_to(db)
             with writer._transaction():
                 writer._bring_up()
                 foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans", "labels")))
                 for table in foreign:
-                    writer._db.execute(f"DELETE FROM {table}")
-                writer._db.execute("DELETE FROM states WHERE whose = 'filter'")
-                writer._db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2', 'labels')")
-                count = writer._db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
+                    db.execute(f"DELETE FROM {table}")
+                db.execute("DELETE FROM states WHERE whose = 'filter'")
+                db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2', 'labels')")
+                count = db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
                 origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only, **base.up()}
                 sensors = {"imu_noise": None if noise is None else asdict(noise)}
-                writer._tell({**info, **sensors, "map": origin, "finished": False})
-            writer._db.close()
+                writer._set_info({**info, **sensors, "map": origin, "finished": False})
+            db.close()
             os.replace(part, path)
         return cls.reopen(path)
 
@@ -127,20 +135,18 @@ class SessionWriter:
 
         Raises DataError when the file is missing, not ours or damaged, StorageError when it cannot be written.
         """
-        writer = cls.__new__(cls)
-        writer.path = path
         with storage(path):
-            writer._db = connect(path, isolation_level=None)
+            writer = cls(path, db := connect(path, isolation_level=None))
         try:
             with readable(path):
-                check_sound(writer._db, path)
-                newest = json.loads(writer._db.execute("SELECT value FROM newest").fetchone()[0])
+                check_sound(db, path)
+                newest = json.loads(db.execute("SELECT value FROM newest").fetchone()[0])
             with storage(path), writer._transaction():
                 writer._move(update, record)
                 changed = {**newest, "revision": update.revision, "vo_scale": record.vo_scale, **_own_record(record)}
                 writer._replace("newest", [(1, json.dumps(changed))])
         finally:
-            writer._db.close()
+            db.close()
 
     def _bring_up(self) -> None:
         """Give a session of an older format the tables that it lacks."""
@@ -150,25 +156,15 @@ class SessionWriter:
                 self._db.execute(statement)
             self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
-    def _open(self, path: Path) -> None:
-        self.path = path
-        self._frames: list[FrameEntry] = []
-        self._edges = 0
-        self._first_id = 0  # of the keyframes of this recording
-        with storage(path):
-            self._db = connect(path, isolation_level=None)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=NORMAL")
-
     def base(self) -> dict[str, Any] | None:
         """Return the map in which the run began, if it did: its path, its number of keyframes, whether it is held."""
         row = self._db.execute("SELECT value FROM info WHERE key = 'map'").fetchone()
         return None if row is None else dict(json.loads(row[0]))
 
-    def tell(self, entries: dict[str, Any]) -> None:
+    def set_info(self, entries: dict[str, Any]) -> None:
         """Commit entries of the info table."""
         with storage(self.path), self._transaction():
-            self._tell(entries)
+            self._set_info(entries)
 
     def add_frame(self, frame: FrameEntry) -> None:
         """Remember a frame; it is committed with the next keyframe, or by `close`."""
@@ -187,9 +183,9 @@ class SessionWriter:
         )  # fmt: skip
         with storage(self.path), self._transaction():
             if keyframe.id == 0:
-                self._tell({"first_state": None if entry.start is None else state_data(entry.start.first_state)})
+                self._set_info({"first_state": None if entry.start is None else state_data(entry.start.first_state)})
             if keyframe.id == self._first_id and entry.start is not None:
-                self._tell({"start": _start_data(entry.start)})
+                self._set_info({"start": _start_data(entry.start)})
             self._insert("keyframes", [row])
             self._insert("packets", [packet_row(packet, update.newest)])
             self._insert("readings", reading_rows(packet))
@@ -226,7 +222,7 @@ class SessionWriter:
         with storage(self.path):
             with self._transaction():
                 self._write_frames()
-                self._tell({"finished": finished})
+                self._set_info({"finished": finished})
             with suppress(sqlite3.OperationalError):  # a reader has it open: all is committed, and the log stays beside
                 self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
                 self._db.execute("PRAGMA journal_mode=DELETE")  # so that readers leave no files beside it
@@ -266,7 +262,7 @@ class SessionWriter:
         self._replace("frames", [_frame_row(frame) for frame in self._frames])
         self._frames = []
 
-    def _tell(self, entries: dict[str, Any]) -> None:
+    def _set_info(self, entries: dict[str, Any]) -> None:
         self._replace("info", [(key, json.dumps(value)) for key, value in entries.items()])
 
     def _replace(self, table: str, rows: list[tuple[Any, ...]]) -> None:
@@ -287,6 +283,14 @@ class SessionWriter:
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             raise
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    with storage(path):
+        db = connect(path, isolation_level=None)
+        db.execute("PRAGMA journal_mode=WAL")
+        db.execute("PRAGMA synchronous=NORMAL")
+    return db
 
 
 def _start_data(start: StartFacts) -> dict[str, Any]:
