@@ -137,7 +137,7 @@ def test_only_bags_take_options(tmp_path: Path) -> None:
 def test_what_a_bag_lacks_is_named_with_the_option_that_gives_it(tmp_path: Path, noise: CalibrationConfig) -> None:
     messages = list(from_asl(write_asl(tmp_path / "asl"), types_of("mcap")))
     path = write_bag(tmp_path, "mcap", [m for m in messages if m.topic != "/tf_static"])
-    with pytest.raises(DataError, match=r"how noisy its IMU \(/imu0\) is; give --calibration.imu-noise"):
+    with pytest.raises(DataError, match=r"the noise of its IMU \(/imu0\); give --calibration.imu-noise"):
         open_dataset(str(path))
     with pytest.raises(DataError, match=r"no transform from cam0 to imu .* --calibration.camera FILE with T_cam_imu"):
         open_dataset(str(path), noise)

@@ -9,7 +9,7 @@ from vislam.config import load
 from vislam.core.geometry import invert, se3_log
 from vislam.core.memory import TagSighting
 from vislam.core.messages import Frame, Keyframe
-from vislam.loop import detector as detector_module
+from vislam.loop import closer as closer_module
 from vislam.loop.closer import LoopCloser
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.vision.features import find_tags
@@ -127,7 +127,7 @@ def searched(monkeypatch, settings, tagged=()):
         looked.append(frame.index)
         return (TagSighting(7, 40.0, None, None),) if frame.index in tagged else ()
 
-    monkeypatch.setattr(detector_module, "sight_tags", sight)
+    monkeypatch.setattr(closer_module, "sight_tags", sight)
     detector = LoopCloser(load(None, settings).loop, RIG, SEED)
     nothing = np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3))
     for k in range(14):
