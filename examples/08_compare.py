@@ -9,8 +9,8 @@ themselves. Which is better, with one camera and a cheap IMU? `vislam compare PL
 import numpy as np
 
 from vislam.config import Config, load
-from vislam.core import Frame, StageClock, VislamError
-from vislam.pipeline import Front
+from vislam.core import StageClock, VislamError
+from vislam.pipeline import Front, odometry
 from vislam.sim import open_points
 from vislam.trajectory import Trajectory, evaluate
 
@@ -21,17 +21,11 @@ def error_m(seed: int, config: Config) -> float:
     """Return the ATE of the filter alone, without loops or graph, on one world: its seed is that of all noise."""
     world = open_points("laps", seed=seed, rig="stereo", duration_s=8.0, tracks=60, camera_hz=10.0)
     front = Front(config, world.rig, world.imu_noise, StageClock())
-    stamps_ns, poses, waiting = [], [], []
-    for value in world.events():
-        if isinstance(value, Frame):
-            waiting.append(value)
-        else:
-            front.add(value)
-        while waiting and front.is_ready(waiting[0].t_ns, waiting[-1].t_ns):
-            step = front.process(waiting.pop(0))
-            if step.T_odom_body is not None:
-                stamps_ns.append(step.frame.t_ns)
-                poses.append(step.T_odom_body)
+    stamps_ns, poses = [], []
+    for step in odometry(front, world.events()):
+        if step.T_odom_body is not None:
+            stamps_ns.append(step.frame.t_ns)
+            poses.append(step.T_odom_body)
     return evaluate(Trajectory(np.array(stamps_ns), np.array(poses)), world.truth(), "yaw")["ate_rmse_m"]
 
 

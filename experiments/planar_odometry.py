@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -29,10 +28,10 @@ from vislam.config import Config, PlanarConfig
 from vislam.core.clock import StageClock
 from vislam.core.files import write_text
 from vislam.core.geometry import interpolate, invert
-from vislam.core.messages import Array, Frame, NavState, Tracking
+from vislam.core.messages import Array, NavState, Tracking
 from vislam.core.recording import Recording
 from vislam.frontend.planar.odometry import PlanarFrontEnd
-from vislam.pipeline.front import Front
+from vislam.pipeline.front import Front, odometry
 from vislam.pipeline.steps import FrontStep
 from vislam.trajectory import Trajectory
 from vislam.trajectory.consistency import anees
@@ -96,7 +95,7 @@ def follow(recording: Recording, config: Config, name: str) -> tuple[Row, Array,
 
 def drive(front: Front, recording: Recording) -> tuple[list[FrontStep], Array]:
     """Feed a recording; return what came of every frame, and the CPU time of its front end in ms."""
-    cpu, steps, waiting = [], [], deque[Frame]()
+    cpu = []
     track = front.frontend.track
 
     def timed(*arguments: object) -> object:
@@ -106,13 +105,7 @@ def drive(front: Front, recording: Recording) -> tuple[list[FrontStep], Array]:
         return answer
 
     front.frontend.track = timed  # type: ignore[assignment, method-assign]
-    for value in recording.events():
-        if isinstance(value, Frame):
-            waiting.append(value)
-        else:
-            front.add(value)
-        while waiting and front.is_ready(waiting[0].t_ns, waiting[-1].t_ns):
-            steps.append(front.process(waiting.popleft()))
+    steps = list(odometry(front, recording.events()))
     return steps, np.array(cpu)
 
 

@@ -14,7 +14,7 @@ from vislam.core.geometry import so3_exp, transform
 from vislam.core.messages import Frame, ImuSample, NavState, Observations
 from vislam.datasets import open_dataset
 from vislam.ekf import Ekf, MsckfEkf, make_ekf
-from vislam.pipeline.front import Front
+from vislam.pipeline.front import Front, odometry
 from vislam.sim.points.points import open_points
 from vislam.trajectory import Trajectory, align, associate, ate
 from worlds.flight import CHEAP, MONO, RGBD, SIGMAS, STEREO, Flight, motion_of
@@ -297,18 +297,11 @@ def test_real_recording_with_one_camera(data_root) -> None:  # type: ignore[no-u
     recording = open_dataset(str(data_root / "euroc_mh01_17s"))
     config = load(None, {"ekf.coupling": "tight", "frontend.mode": "mono"})
     front = Front(config, recording.rig, recording.imu_noise, StageClock())
-    waiting: list[Frame] = []
     stamps, poses = [], []
-    for value in recording.events():
-        if isinstance(value, Frame):
-            waiting.append(value)
-        else:
-            front.add(value)
-        while waiting and front.is_ready(waiting[0].t_ns, waiting[-1].t_ns):
-            step = front.process(waiting.pop(0))
-            if step.T_odom_body is not None:
-                stamps.append(step.frame.t_ns)
-                poses.append(step.T_odom_body)
+    for step in odometry(front, recording.events()):
+        if step.T_odom_body is not None:
+            stamps.append(step.frame.t_ns)
+            poses.append(step.T_odom_body)
         if len(stamps) >= 160:
             break
     assert len(stamps) >= 160, front.begun.refusal

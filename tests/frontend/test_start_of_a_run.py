@@ -11,8 +11,7 @@ import pytest
 from vislam.config import Config
 from vislam.core.clock import StageClock
 from vislam.core.geometry import invert
-from vislam.core.messages import Frame
-from vislam.pipeline.front import Front
+from vislam.pipeline.front import Front, odometry
 from vislam.pipeline.steps import FrontStep
 from vislam.sim import PointRecording, open_points
 from vislam.trajectory import Trajectory
@@ -30,16 +29,7 @@ class Begun:
     def of(rig: str, start_s: float, duration_s: float) -> Begun:
         recording = open_points("laps", rig=rig, start_s=start_s, duration_s=duration_s, descriptors=False)
         front = Front(Config(), recording.rig, recording.imu_noise, StageClock())
-        frames: list[Frame] = []
-        steps = []
-        for event in recording.events():
-            if isinstance(event, Frame):
-                frames.append(event)
-            else:
-                front.add(event)
-            while frames and front.is_ready(frames[0].t_ns, frames[-1].t_ns):
-                steps.append(front.process(frames.pop(0)))
-        return Begun(front, steps, recording)
+        return Begun(front, list(odometry(front, recording.events())), recording)
 
     def tilts_in_sigmas(self) -> np.ndarray:
         """Return the error of the vertical of every frame over what the filter states."""

@@ -8,7 +8,7 @@ from vislam.core.late import late
 
 if TYPE_CHECKING:
     from vislam.pipeline.back import Back
-    from vislam.pipeline.front import Front
+    from vislam.pipeline.front import Front, odometry
     from vislam.pipeline.steps import Finish, Step
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Finish",
     "Front",
     "Step",
+    "odometry",
 ]
 
 __getattr__ = late(
@@ -25,5 +26,6 @@ __getattr__ = late(
         "Finish": "vislam.pipeline.steps",
         "Front": "vislam.pipeline.front",
         "Step": "vislam.pipeline.steps",
+        "odometry": "vislam.pipeline.front",
     },
 )

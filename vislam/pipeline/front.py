@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -126,10 +128,11 @@ class Front:
         elif isinstance(value, Reading):
             if self.readings is not None:
                 self.readings.add(value)
-        elif self._imu is not None:
+        elif (imu := self._imu) is not None and imu.buffer.add(value):
             with self._clock.measure("ekf predict"):
-                is_taken = self._imu.add(value)
-            if is_taken and self.readings is not None and self.begun.settled is not None:
+                imu.filtering.ekf.predict(value)
+            imu.condition.add(value)
+            if self.readings is not None and self.begun.settled is not None:
                 self.readings.hand_on(value.t_ns)
 
     def add_hint(self, hint: Hint) -> None:
@@ -292,3 +295,15 @@ class Front:
     def report(self) -> FrontReport:
         """Return what there is to say of the run so far."""
         return report_of(self)
+
+
+def odometry(front: Front, values: Iterable[ImuSample | MagSample | Reading | Frame]) -> Iterator[FrontStep]:
+    """Feed measurements to a front half alone, without loops and graph; yield a step for every frame it can process."""
+    waiting = deque[Frame]()
+    for value in values:
+        if isinstance(value, Frame):
+            waiting.append(value)
+        else:
+            front.add(value)
+        while waiting and front.is_ready(waiting[0].t_ns, waiting[-1].t_ns):
+            yield front.process(waiting.popleft())

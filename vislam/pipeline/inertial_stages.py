@@ -8,7 +8,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core.camera import Rig
-from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, ImuSample, ImuSpan, NavState, NoiseScale
+from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, ImuSpan, NavState, NoiseScale
 from vislam.ekf.filtering import Filtering
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
@@ -47,7 +47,7 @@ class Inertial:
         self.condition = ConditionWatch()
         self.filtering = Filtering(config.ekf, noise, config.machine, rig, suite)
         self._rest = RestDetector(config.init, noise)
-        self._stillness = Stillness(config.init)
+        self._stillness = Stillness()
         self._is_corrected = config.ekf.vision != "none"
         self._gravity_m_s2, self._bias_walk = config.machine.gravity_m_s2, noise.gyroscope_random_walk
         self._at_frame: NavState | None = None  # the filter's state at the last frame
@@ -58,14 +58,6 @@ class Inertial:
         """White noise of the IMU over that of its model, as the newest samples show it."""
         floor = self.buffer.noise_floor
         return AS_MODELLED if floor is None else floor.now.scale
-
-    def add(self, sample: ImuSample) -> bool:
-        """Take a sample, with which the filter predicts; False where the buffer refuses it."""
-        if not self.buffer.add(sample):
-            return False
-        self.filtering.ekf.predict(sample)
-        self.condition.add(sample)
-        return True
 
     def since(self, last_t_ns: int | None, t_ns: int, clock: CameraClock) -> Since:
         """Return what is known of the motion since the last frame, None: there was none, with `clock` the camera's."""
