@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import shutil
 import signal
 from contextlib import suppress
 
@@ -9,11 +10,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, 
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 from hypothesis import settings
 
+from browser import FLAGS
 from needs import missing
 
 TESTS = Path(__file__).resolve().parent
@@ -65,3 +68,16 @@ def data_root() -> Path:
     if not root.is_dir():
         missing(f"no recordings at {root}; set VISLAM_DATA to their folder")
     return root
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """A Chromium that draws WebGL in software."""
+    sync = pytest.importorskip("playwright.sync_api")
+    path = shutil.which("chromium")
+    if path is None:
+        missing("chromium is not installed (Debian: apt install chromium)")
+    with sync.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield browser
+        browser.close()

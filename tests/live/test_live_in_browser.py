@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,24 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from browser import CUT, FLAGS, SMALLEST
-from needs import missing
+from browser import CUT, SMALLEST
 
 _PATIENCE_MS = 400_000
 _WORLD = "replay:points:laps,rig=rgbd,camera_hz=10,duration_s=600"
 _NO_EXIT_S = 300
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    sync = pytest.importorskip("playwright.sync_api")
-    path = shutil.which("chromium")
-    if path is None:
-        missing("chromium is not installed (Debian: apt install chromium)")
-    with sync.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 class Live:

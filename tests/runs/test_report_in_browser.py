@@ -1,13 +1,11 @@
 """The report's page in a real browser: nothing fails, nothing leaves it, nothing is cut, and its parts are linked."""
 
 import os
-import shutil
 
 import numpy as np
 import pytest
 
-from browser import CUT, FLAGS, SMALLEST
-from needs import missing
+from browser import CUT, SMALLEST
 from run_folder import LOST, PERIOD_NS, make_run
 from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.semantic.classes import LabelClasses
@@ -27,19 +25,6 @@ COLORS = """() => {
 
 
 @pytest.fixture(scope="module")
-def browser():
-    """A Chromium that draws WebGL in software."""
-    sync = pytest.importorskip("playwright.sync_api")
-    path = shutil.which("chromium")
-    if path is None:
-        missing("chromium is not installed (Debian: apt install chromium)")
-    with sync.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        yield chromium
-        chromium.close()
-
-
-@pytest.fixture(scope="module")
 def report(tmp_path_factory):
     run = make_run(tmp_path_factory.mktemp("runs") / "cart")
     rng = np.random.default_rng(1)
@@ -51,8 +36,8 @@ def report(tmp_path_factory):
 class Opened:
     """A page that is ready, with what went wrong in it and what it asked of the network."""
 
-    def __init__(self, browser, path, width=1400, scheme="light", javascript=True):
-        self.context = browser.new_context(
+    def __init__(self, chromium, path, width=1400, scheme="light", javascript=True):
+        self.context = chromium.new_context(
             viewport={"width": width, "height": 900},
             color_scheme=scheme,
             has_touch=width < 500,
@@ -79,9 +64,9 @@ class Opened:
 
 
 @pytest.fixture(scope="module")
-def page(browser, report):
+def page(chromium, report):
     """The report on a desk's screen, for tests that do one thing after another on one page."""
-    with Opened(browser, report) as opened:
+    with Opened(chromium, report) as opened:
         yield opened
 
 
@@ -95,8 +80,8 @@ def move_to(page, share):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1400, 400])
-def test_nothing_fails_or_is_cut_and_the_map_is_drawn(browser, report, tmp_path, width, scheme):
-    with Opened(browser, report, width, scheme) as page:
+def test_nothing_fails_or_is_cut_and_the_map_is_drawn(chromium, report, tmp_path, width, scheme):
+    with Opened(chromium, report, width, scheme) as page:
         assert page.evaluate("document.documentElement.scrollWidth") == width
         assert page.evaluate(CUT) == []
         assert page.evaluate(SMALLEST) >= 11.0
@@ -184,8 +169,8 @@ def tap_above(page):
     page.wait_for_function("window.clicked")
 
 
-def test_the_map_turns_and_nears_under_fingers_and_a_tap_tells_of_a_loop(browser, report):
-    with Opened(browser, report, width=400) as page:
+def test_the_map_turns_and_nears_under_fingers_and_a_tap_tells_of_a_loop(chromium, report):
+    with Opened(chromium, report, width=400) as page:
         fingers, loops = Fingers(page), page.locator("#view-details .loop:not([hidden])")
         stands = "() => window.vislamReport.view.camera.position.toArray()"
         away = "() => { const v = window.vislamReport.view; return v.camera.position.distanceTo(v.controls.target); }"
@@ -224,14 +209,14 @@ def test_plots_zoom_together(page):
     page.wait_for_function(f"(span) => ({spans})().every((s) => Math.abs(s - span) < 1e-6)", arg=whole[0])
 
 
-def test_without_javascript_the_pictures_stand(browser, report):
-    with Opened(browser, report, javascript=False) as page:
+def test_without_javascript_the_pictures_stand(chromium, report):
+    with Opened(chromium, report, javascript=False) as page:
         assert page.locator("section.still").count() == 3
         assert all(section.is_visible() for section in page.locator("section.still").all())
         assert not page.locator("#view").is_visible()
 
 
-def test_what_a_run_folder_says_is_never_run(browser, tmp_path):
+def test_what_a_run_folder_says_is_never_run(chromium, tmp_path):
     run = make_run(tmp_path / "hostile")
     evil = "</script><script>document.title='owned'</script><img src=x onerror=\"document.title='owned'\">"
     loops = (run / "loops.csv").read_text().replace("verified", evil.replace('"', "'").replace(",", ";"))
@@ -239,15 +224,15 @@ def test_what_a_run_folder_says_is_never_run(browser, tmp_path):
     tracking = (run / "tracking.csv").read_text()
     (run / "tracking.csv").write_text(tracking.replace("image too dark", "</script><script>"))
     (run / "metrics.json").write_text((run / "metrics.json").read_text().replace("workshop-cart", "<b>cart"))
-    with Opened(browser, write_report(run)) as page:
+    with Opened(chromium, write_report(run)) as page:
         move_to(page, 0.6)
         page.evaluate("window.vislamReport.details.onLoop(0)")
         assert page.title() == "vislam: <b>cart"
         assert "</script>" in page.locator("#view-details .loop").inner_text()
 
 
-def test_on_paper_the_pictures_stand_and_it_is_short(browser, report):
-    with Opened(browser, report, scheme="dark") as page:
+def test_on_paper_the_pictures_stand_and_it_is_short(chromium, report):
+    with Opened(chromium, report, scheme="dark") as page:
         page.emulate_media(media="print")
         assert not page.locator("#view").is_visible()
         assert page.locator("section.still").first.is_visible()
@@ -255,7 +240,7 @@ def test_on_paper_the_pictures_stand_and_it_is_short(browser, report):
         assert 1 <= pages <= 4
 
 
-def test_labels_are_shown_by_class_and_each_can_be_turned_off(browser, tmp_path):
+def test_labels_are_shown_by_class_and_each_can_be_turned_off(chromium, tmp_path):
     run = make_run(tmp_path / "labels")
     x, y = (side.ravel() for side in np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-4, 4, 0.05)))
     keys = np.unique(voxel_keys(np.stack([x, y, np.full_like(x, 0.01)], axis=1), 0.05))
@@ -268,7 +253,7 @@ def test_labels_are_shown_by_class_and_each_can_be_turned_off(browser, tmp_path)
         for (let k = 0; k < colors.length; k += 4) count += colors[k] > 200 && colors[k + 1] < 60 && colors[k + 2] < 60;
         return count; }}"""
     for width in (1400, 400):
-        with Opened(browser, write_report(run), width) as page:
+        with Opened(chromium, write_report(run), width) as page:
             before = page.evaluate(red)
             assert not page.locator(".legend.labels").is_visible()
             page.locator("#view-layers input[name=labels]").check()
