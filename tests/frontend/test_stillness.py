@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vislam.config import InitConfig
 from vislam.core.camera import Camera
 from vislam.core.geometry import so3_exp, transform, transform_points
 from vislam.core.messages import Array, Observations
@@ -52,7 +51,7 @@ def film(
 
 def answers(frames: list[tuple[int, Observations]]) -> list[bool]:
     """Return what `Stillness` says at every frame."""
-    stillness = Stillness(InitConfig())
+    stillness = Stillness()
     return [stillness.add(*frame) for frame in frames]
 
 
@@ -103,7 +102,7 @@ def test_motion_that_cannot_be_told_is_no_rest() -> None:
 
 def resting(frames: list[tuple[int, Observations]]) -> list[bool]:
     """Return whether `Stillness` sees a rest go on, at every frame."""
-    stillness, said = Stillness(InitConfig()), []
+    stillness, said = Stillness(), []
     for frame in frames:
         stillness.add(*frame)
         said.append(stillness.resting)
@@ -136,7 +135,7 @@ def test_a_slow_start_ends_the_rest_no_later_than_a_centimetre_away() -> None:
 
 
 def test_numbers_behind_the_answer() -> None:
-    stillness = Stillness(InitConfig())
+    stillness = Stillness()
     for frame in film(lambda t: transform(np.eye(3), np.array([0.0, 0.1 * t, 0.0])), 1.0, 0.7, 17):
         stillness.add(*frame)
     assert 0.6 < stillness.noise_px < 0.8

@@ -15,11 +15,10 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.config import InitConfig
 from vislam.core.messages import Array, Observations
 from vislam.core.quantiles import median
 
-_STILL_PX = 0.8  # median image motion over 0.5 s, noise taken out: below, the camera may be at rest
+_STILL_PX = 0.8  # median image motion over the window and from frame to frame, noise taken out: below, it may be rest
 _NS = 1_000_000_000
 _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
 _MAX_INTERVAL_NS = _NS  # tracks that bridge a longer pause say nothing about what was in it
@@ -45,9 +44,8 @@ class Stillness:
         noise_px: standard deviation of one coordinate of a pixel about its line; NaN where it could not be told.
     """
 
-    def __init__(self, config: InitConfig) -> None:
-        """Start empty; `config.still_px` is the limit for motion over the window and from frame to frame."""
-        self._limit_px = _STILL_PX
+    def __init__(self) -> None:
+        """Start empty."""
         self._frames: deque[tuple[int, NDArray[np.int64], Array]] = deque()  # time, ascending ids, pixels
         self.resting = False
         self._places = _Places()  # of frames of this rest that are older than the window
@@ -96,7 +94,7 @@ class Stillness:
         at = np.minimum(np.searchsorted(old_ids, ids), len(old_ids) - 1)
         both = old_ids[at] == ids
         moved = np.hypot(*(new[both] - old[at[both]]).T)
-        return len(moved) >= _MIN_TRACKS and median(moved) > _FAR * self._limit_px
+        return len(moved) >= _MIN_TRACKS and median(moved) > _FAR * _STILL_PX
 
     def _follow_rest(self, t_ns: int, times_limit: float) -> None:
         """Begin a rest, go on with it or end it; one that ends by displacement begins again after a whole window."""
@@ -150,7 +148,7 @@ class Stillness:
         if known.sum() < _MIN_TRACKS:
             return 0.0
         moved = np.nanmean(now[:, known], axis=0) - places[known]
-        near = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < _WIDEST * self._limit_px
+        near = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < _WIDEST * _STILL_PX
         if near.mean() < 0.5:
             return np.inf
         self._places.forget(ids[known][~near])  # slipped onto other corners
@@ -169,7 +167,7 @@ class Stillness:
         excess = float(np.median((differing**2).sum(axis=1))) / _MEDIAN_SQUARE - variance
         chance = _SIGNIFICANT * variance / (np.log(2.0) * np.sqrt(len(flow)))  # of a median that is a variance
         parallax_px = float(np.sqrt(max(excess, 0.0)))
-        limit_px = min(max(self._limit_px, float(np.sqrt(chance))), _WIDEST * self._limit_px)
+        limit_px = min(max(_STILL_PX, float(np.sqrt(chance))), _WIDEST * _STILL_PX)
         moved = self._in_limits(moved_px, 2.0 * np.sqrt(variance / len(flow)))
         return max(moved, parallax_px / limit_px), moved_px, parallax_px
 
@@ -184,7 +182,7 @@ class Stillness:
         return self._in_limits(moved_px, 2.0 * np.sqrt(2.0 / both.sum()) * self.noise_px)
 
     def _in_limits(self, moved_px: float, sigma_px: float) -> float:
-        return moved_px / min(max(self._limit_px, _SIGNIFICANT * sigma_px), _WIDEST * self._limit_px)
+        return moved_px / min(max(_STILL_PX, _SIGNIFICANT * sigma_px), _WIDEST * _STILL_PX)
 
 
 class _Places:

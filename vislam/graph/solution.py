@@ -24,6 +24,7 @@ from vislam.factors.solvers import (
     optimize,
 )
 from vislam.graph.measurements import ImuBetween, Measurement
+from vislam.graph.records import graph_of
 from vislam.graph.settling import BATCH_ITERATIONS, short
 
 _IMU_ROUNDS = 3  # of a batch, in which inertial data are integrated at the biases of the one before
@@ -87,7 +88,7 @@ class Solution:
         if not (incremental and isinstance(self._solver, IncrementalSolver)):
             return self._restart(everything, values, incremental)
         try:
-            self._solver.update(_graph([factor for one in fresh for factor in one.factors(values)]), new, [])
+            self._solver.update(graph_of([factor for one in fresh for factor in one.factors(values)]), new, [])
             self.values = self._solver.estimate()
         except FAILURES as error:
             return self._restart(everything, values, True, f"gtsam failed ({short(error)}); ")
@@ -123,9 +124,9 @@ class Solution:
             return ""
         assert self._solver is not None
         try:
-            plain = self._solver.update(_graph([loop.factor(robust=False)]), gtsam.Values(), [])
+            plain = self._solver.update(graph_of([loop.factor(robust=False)]), gtsam.Values(), [])
             self._solver.iterate(LOOP_ITERATIONS)
-            slots = self._solver.update(_graph([loop.factor(robust=True)]), gtsam.Values(), plain)
+            slots = self._solver.update(graph_of([loop.factor(robust=True)]), gtsam.Values(), plain)
             self._solver.iterate(1)
             self.values = self._solver.estimate()
         except FAILURES as error:
@@ -178,7 +179,7 @@ class Solution:
         """Return all factors at an estimate, and of each the loop that it is of."""
         factors = [factor for one in self._measurements for factor in one.factors(values)]
         labels = [*[None] * len(factors), *self._loops]
-        return _graph([*factors, *(loop.factor(robust=True) for loop in self._loops.values())]), labels
+        return graph_of([*factors, *(loop.factor(robust=True) for loop in self._loops.values())]), labels
 
     def _known(self, loop: LoopModel) -> Array | None:
         """Return the covariance [6, 6] of a loop's relative pose without it."""
@@ -194,10 +195,3 @@ class Solution:
         if chi2 is None:
             chi2 = self._reports[loop.id].chi2 if loop.id in self._reports else float("nan")
         self._reports[loop.id] = EdgeReport(record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason)
-
-
-def _graph(factors: Sequence[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph

@@ -20,7 +20,7 @@ _NO_FIELD = np.full(3, np.nan)
 
 
 class Complementary:
-    """Owns attitude, bias and filtered force; its error is `attitude.tilt_sigma_deg`."""
+    """Owns attitude, bias and filtered force; its error is constant."""
 
     def __init__(self, config: AttitudeConfig, gravity_m_s2: float, R_world_body: Array, bias: Array) -> None:
         """Begin with an attitude [3, 3] and a bias [3]."""

@@ -59,7 +59,6 @@ class DepthInMap:
         self._T_map_odom_told: Array | None = None
         self._way_m, self._T_odom_before = 0.0, np.eye(4)
         self._since_s, self._t_ns_before = 0.0, 0  # from the keyframe before to the newest
-        self._depth_apart_s = DEPTH_APART_S
         self._T_body_cam = rig.T_body_cams[0]
         self._last: _Last | None = None
         self.counters = {"asked": 0, "refused": 0, "alone": 0, "offered": 0}
@@ -172,7 +171,7 @@ class DepthInMap:
         if moved is None or not self._since_s > 0.0:
             return np.zeros((6, 6))
         twist_per_s = se3_log(moved) / self._since_s
-        return 2.0 * self._depth_apart_s**2 * np.outer(twist_per_s, twist_per_s)
+        return 2.0 * DEPTH_APART_S**2 * np.outer(twist_per_s, twist_per_s)
 
     def _follow(self, odometry: OdometryKeyframe) -> None:
         """Carry on the pose that somebody gave of the first keyframe, and the time; a loss of track ends the former."""

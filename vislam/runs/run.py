@@ -10,6 +10,7 @@ from typing import Any
 from vislam.config import Config, load
 from vislam.core.errors import VislamError
 from vislam.core.log import log_to
+from vislam.core.recording import Recording
 from vislam.core.up import parse_up
 from vislam.datasets.calibrated import with_clock
 from vislam.pipeline.settings import derived
@@ -58,10 +59,8 @@ def run_source(
     localize_only: bool, show: Show,
 ) -> dict[str, Any]:  # fmt: skip
     """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
-    parse_up(config.up)
-    config = with_clock(config)
     choice = map_choice(base, localize_only, config)
-    recording = open_source(source, config.seed, config.calibration)
+    config, recording = _opened(source, config)
     prepare(out, overwrite, choice)
     with written_up(out, command), show(recording.name) as progress:
         return execute(recording, config, out, source, command, progress, choice)
@@ -69,10 +68,14 @@ def run_source(
 
 def resolved(source: str, config: Config) -> Config:
     """Return what config.json of a run of this source would hold: the settings, and what follows from its sensors."""
+    config, recording = _opened(source, config)
+    return derived(config, recording.rig, imu_noise(config.imu, recording.imu_noise))
+
+
+def _opened(source: str, config: Config) -> tuple[Config, Recording]:
     parse_up(config.up)
     config = with_clock(config)
-    recording = open_source(source, config.seed, config.calibration)
-    return derived(config, recording.rig, imu_noise(config.imu, recording.imu_noise))
+    return config, open_source(source, config.seed, config.calibration)
 
 
 @contextmanager

@@ -113,7 +113,7 @@ class Initialiser:
         Args:
             span: inertial data since the frame before, no bias taken off; None for the first frame or across a hole.
             vo: visual motion at the frame.
-            at_rest_by_image: the image hardly moved since the frame before (below `config.still_px`).
+            at_rest_by_image: the image hardly moved since the frame before (see `Stillness`).
             observations: the tracks in the frame; without scale they are what a moving start is made of.
         """
         still_by_imu = self._rest.add(span)

@@ -28,7 +28,7 @@ _DEGRADED_SHARE = 0.2  # of the frames on which vision may lean weakly
 _MISSING_SHARE = 0.1  # of the frames that may never arrive: patches are followed over twice the interval then
 _REPEATED_FRAMES = 3  # images equal to the last bit in motion: one may be a hiccup, a stuck driver sends many
 _REFUSED_SHARE = 0.1  # of visual measurements that the filter may refuse: more than outliers explain
-_CONTRADICTING_SHARE = 0.25  # of verified loops that the graph may refuse, as `graph.join_max_contradicting`
+_CONTRADICTING_SHARE = 0.25  # of verified loops that the graph may refuse, as `graph/joining.py` does
 _UNIFORM_S = 20.0  # one camera without motion that shows scale: biases have walked away by then
 _SIGMA_M = 1.0  # of the filter's position at its worst: no controller can use it
 # rms between filter and graph over what both admit: independent models would differ by 1
