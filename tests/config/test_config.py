@@ -1,11 +1,16 @@
 import json
+import re
+from pathlib import Path
 
 import pytest
 
 from vislam.cli import run_verb
 from vislam.config import Config, dump, from_data, load, recorded
 from vislam.config.profiles import PROFILES
+from vislam.config.ranges import settings_of
 from vislam.core.errors import UsageError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_defaults_survive_a_round_trip_through_json():
@@ -88,3 +93,21 @@ def test_settings_recorded_by_an_earlier_version_are_read():
 def test_an_option_that_moved_says_where(capsys):
     assert run_verb(["run", "tum:X", "--out", "OUT", "--ekf.no-nonholonomic"]) == 2
     assert "--ekf.no-nonholonomic is now --machine.slip-sigma-m-s" in capsys.readouterr().err
+
+
+def test_settings_that_docs_and_docstrings_name_exist():
+    known = {".".join(setting.path) for setting in settings_of(Config)}
+    sections = {path.split(".")[0] for path in known if "." in path}
+    elsewhere = {"live.power_up"}  # a counter of metrics.json
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "vislam").rglob("*.py")]
+    missing = []
+    for page in pages:
+        for name in re.findall(r"`(?:--)?([a-z_]+(?:\.[a-z0-9_-]+)+)(?:[ =][^`]*)?`", page.read_text(encoding="utf-8")):
+            plain = name.replace("-", "_").replace(".no_", ".")
+            module = (ROOT / "vislam").joinpath(*plain.split(".")[:2])
+            is_file = (
+                name.endswith((".yaml", ".toml", ".json")) or module.is_dir() or module.with_suffix(".py").exists()
+            )
+            if plain.split(".")[0] in sections and plain not in known | elsewhere and not is_file:
+                missing.append(f"{page.relative_to(ROOT)}: {name}")
+    assert missing == []
