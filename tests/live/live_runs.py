@@ -31,14 +31,18 @@ FILES = {
 }  # fmt: skip
 
 
-def settings(name: str = "going-on", **others: object) -> Config:
+def settings(name: str = "going-on", *, dense: bool = False, **others: object) -> Config:
+    """Settings of a live run without a viewer; `dense`: with a map of voxels, which takes seconds to rehearse."""
     live = {f"live.{key}": value for key, value in {"send_to": (), **others}.items()}
-    return load(None, {"view.enabled": False, "live.name": f"vislam-test-{name}-{os.getpid()}", **live})
+    off = {"view.enabled": False, "map.enabled": dense}
+    return load(None, {**off, "live.name": f"vislam-test-{name}-{os.getpid()}", **live})
 
 
-def begin(out: Path, base: MapChoice | None = None, outages: Outages | None = None) -> LiveRun:
+def begin(
+    out: Path, base: MapChoice | None = None, outages: Outages | None = None, *, dense: bool = False
+) -> LiveRun:
     """Return a run that goes on with what is in a folder, or begins in a map, or begins."""
-    source, config = ReplaySource(WORLD, outages=outages), settings()
+    source, config = ReplaySource(WORLD, outages=outages), settings(dense=dense)
     if (out / "session.db").exists():
         beginning = resumed(out, source, config)
         assert beginning is not None

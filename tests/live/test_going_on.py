@@ -92,7 +92,7 @@ def test_frames_whose_keyframes_waited_at_the_end_are_not_lost(tmp_path: Path) -
 def test_a_run_begins_in_the_map_of_another(interrupted, tmp_path: Path) -> None:
     out, _ = interrupted
     old = (out / "session.db").read_bytes()
-    run = begin(tmp_path / "next", MapChoice(out, True))
+    run = begin(tmp_path / "next", MapChoice(out, True), dense=True)
     found = run.execute(until(is_found, interrupt), PATIENCE_S)
     assert (out / "session.db").read_bytes() == old
     assert found["map"]["localize_only"] is True

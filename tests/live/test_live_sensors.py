@@ -41,8 +41,9 @@ file = "baro.csv"
 
 
 def settings(file: Path | None) -> Config:
-    told = {"view.enabled": False, "live.name": f"vislam-test-sensors-{os.getpid()}", "live.send_to": ()}
-    return load(None, told | ({} if file is None else {"sensors.file": str(file)}))
+    off = {"view.enabled": False, "map.enabled": False, "live.send_to": ()}
+    further = {} if file is None else {"sensors.file": str(file)}
+    return load(None, {**off, **further, "live.name": f"vislam-test-sensors-{os.getpid()}"})
 
 
 @pytest.fixture(scope="module")

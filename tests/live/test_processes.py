@@ -41,7 +41,7 @@ def start(
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list[Health]]:
     """A run to its end in which the IMU and then the camera are unplugged, and the health that was seen on the way."""
     outages = Outages(imu=((8.0, 9.0),), camera=((11.0, 13.0),))
-    live, out = start(tmp_path_factory.mktemp("live"), "whole", outages)
+    live, out = start(tmp_path_factory.mktemp("live"), "whole", outages, dense=True)
     live.notes = Notes()
     metrics = live.execute(duration_s=16.0)
     assert left_behind("whole") == []

@@ -201,9 +201,11 @@ class PointRecording:
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | Frame]:
         """Yield samples and frames in order of their stamps; can be called again and yields the same again.
 
-        Tracks depend on what was followed before, so nothing is left out before `from_ns`.
+        Tracks depend on what was followed before, so no frame is left out before `from_ns`, unless all are before it.
         """
-        streams: list[Iterator[ImuSample | Frame]] = [self._imu.samples(), self._frames()]
+        streams: list[Iterator[ImuSample | Frame]] = [self._imu.samples()]
+        if from_ns is None or (self._stamps_ns >= from_ns).any():
+            streams.append(self._frames())
         yield from heapq.merge(*streams, key=lambda event: event.t_ns)
 
     def tracker(self) -> SimulatedTracker:
@@ -219,7 +221,7 @@ class PointRecording:
 
     def _frames(self) -> Iterator[Frame]:
         options, tracker = self.options, self.tracker()
-        stamps = self._ns(self._frame_s - options.time_offset_s).tolist()
+        stamps = self._stamps_ns.tolist()
         zero_s = self._begin_s + _MARGIN_S
         for index, (t_s, t_ns) in enumerate(zip(self._frame_s.tolist(), stamps, strict=True)):
             since_s = t_s - zero_s
@@ -229,6 +231,10 @@ class PointRecording:
                 length_s = np.inf if options.moving_length_s is None else options.moving_length_s
                 tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, length_s))
             yield Frame(t_ns, index, (), tracks=tracks)
+
+    @property
+    def _stamps_ns(self) -> Stamps:
+        return self._ns(self._frame_s - self.options.time_offset_s)
 
     # -- truth -------------------------------------------------------------------------------------------------------
 
