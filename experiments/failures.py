@@ -89,7 +89,7 @@ def _writers(run_out: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield name, command and copies of every verb that writes."""
     yield "run", f"run {_WORLD} --out {{place}}/{run_out}", ()
     yield "demo", "demo --out {place}/demo", ()
-    yield "simulate", "simulate corridor-loop --duration-s 1 --out {place}/world", ()
+    yield "simulate", "simulate corridor-loop --duration-s 1 --image-width-px 160 --out {place}/world", ()
     yield "simulate graph", "simulate --graph grid3d --out {place}/world.g2o", ()
     yield "optimize", "optimize {place}/run", ("run",)
     yield "join", "optimize {data}/run {data}/other --out {place}/both", ()
@@ -186,7 +186,7 @@ def make_data(data: Path) -> None:
     for command in (
         f"run {_WORLD} --out {data}/run --view.no-enabled",
         f"run {_WORLD} --out {data}/other --view.no-enabled",
-        f"simulate corridor-loop --duration-s 1 --out {data}/world",
+        f"simulate corridor-loop --duration-s 1 --image-width-px 160 --out {data}/world",
         f"simulate --graph grid3d --out {data}/graph.g2o",
     ):
         subprocess.run([sys.executable, "-m", "vislam", *command.split()], check=True, stdout=subprocess.DEVNULL)

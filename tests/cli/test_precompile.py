@@ -1,5 +1,6 @@
 """What `./run setup` compiles ahead: jobs leave stamps when they are done, and are not done again."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 from vislam.cli import precompile
 from vislam.cli.precompile import JOBS, Job
 from vislam.cli.verbs import VERBS
+from worlds.compiled import optimised_afresh
 
 
 @pytest.fixture(autouse=True)
@@ -26,11 +28,13 @@ def test_jobs_are_verbs() -> None:
 
 
 @pytest.mark.slow
-def test_a_job_compiles_once(kernels: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_a_job_compiles_once(kernels: Path, tmp_path_factory, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    shutil.copytree(optimised_afresh(tmp_path_factory) / "kernels", kernels, dirs_exist_ok=True)  # the rest is left
+    before = len(list(kernels.rglob("*.nbc")))
     monkeypatch.setattr(precompile, "JOBS", {"graphs": JOBS["graphs"]})
     assert precompile.main([]) == 0
     assert "compiled in" in capsys.readouterr().err
-    assert len(list(kernels.rglob("*.nbc"))) > 20
+    assert len(list(kernels.rglob("*.nbc"))) > max(before, 20)
     monkeypatch.setattr(subprocess, "Popen", None)
     assert precompile.main([]) == 0
     assert capsys.readouterr().err == ""

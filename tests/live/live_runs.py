@@ -38,9 +38,7 @@ def settings(name: str = "going-on", *, dense: bool = False, **others: object) -
     return load(None, {**off, "live.name": f"vislam-test-{name}-{os.getpid()}", **live})
 
 
-def begin(
-    out: Path, base: MapChoice | None = None, outages: Outages | None = None, *, dense: bool = False
-) -> LiveRun:
+def begin(out: Path, base: MapChoice | None = None, outages: Outages | None = None, *, dense: bool = False) -> LiveRun:
     """Return a run that goes on with what is in a folder, or begins in a map, or begins."""
     source, config = ReplaySource(WORLD, outages=outages), settings(dense=dense)
     if (out / "session.db").exists():
