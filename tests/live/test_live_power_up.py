@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from vislam.config import Config, Gy85Config, SensorsConfig, load
-from vislam.core.errors import DataError, TrackingLostError
+from vislam.core.errors import DataError
 from vislam.hw.emulator import EmulatedBus, SteppedClock, Truth
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
@@ -194,23 +193,6 @@ def live(tmp_path: Path, memory: Path) -> LiveRun:
     asked = "virtual-cart,camera_hz=2,image_width_px=64,laps=0"
     source, config = open_live(asked, base, SensorsConfig())
     return LiveRun(source, config, out, asked, ["vislam", "live"])
-
-
-@pytest.mark.slow
-def test_a_run_of_the_virtual_cart_remembers_its_bias(tmp_path: Path) -> None:
-    """It stands, with a window short enough to have no hole on a busy machine; what vision makes of it is open."""
-    memory = tmp_path / "biases.json"
-    run = live(tmp_path, memory)
-
-    def until_zeroed(run: LiveRun) -> None:
-        if memory.exists():
-            run.stop()
-
-    with suppress(TrackingLostError, DataError):
-        run.execute(until_zeroed, duration_s=120.0)
-    told = run.notes["fast"]["power_up"]
-    assert told["tilt_deg"] < 1.0
-    np.testing.assert_allclose(BiasMemory.read(memory, 64).at(25.0), told["gyro_bias_rad_s"])
 
 
 def test_a_damaged_memory_is_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 from vislam.config import Config, SensorsConfig, load
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.hw.health import Health
+from vislam.imu import BiasMemory
 from vislam.live.epoch import Epoch
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
@@ -193,10 +194,14 @@ def test_only_a_calibration_makes_a_magnetometer_count() -> None:
         assert open_live(asked, Config(), sensors)[0].is_mag_calibrated is counts
 
 
-def test_without_a_camera_attitude_is_published_until_ctrl_c_and_the_folder_is_complete(tmp_path: Path) -> None:
+def test_without_a_camera_attitude_is_published_and_the_bias_kept_until_ctrl_c(
+    tmp_path: Path,
+) -> None:
     out, name = tmp_path / "run", f"vislam-test-blind-{os.getpid()}"
     prepare(out, overwrite=False)
-    base = load(None, {"live.name": name, "live.send_to": (), "power_up.window_s": 1.0})
+    memory = tmp_path / "biases.json"
+    power_up = {"power_up.window_s": 0.5, "power_up.memory": str(memory)}  # no hole in it on a busy machine
+    base = load(None, {"live.name": name, "live.send_to": (), **power_up})
     source, config = open_live("virtual-cart,rig=none,laps=0", base, SensorsConfig())
     live = LiveRun(source, config, out, "virtual-cart", ["vislam", "live"])
     told: list[dict] = []
@@ -207,7 +212,7 @@ def test_without_a_camera_attitude_is_published_until_ctrl_c_and_the_folder_is_c
         status = run.notes.get("fast", {}).get("status")
         if status:
             told.append(status)
-            if Health.LEVELLED in Health(status["health"]) and not interrupted:
+            if Health.LEVELLED in Health(status["health"]) and memory.exists() and not interrupted:
                 interrupted.append(True)
                 os.kill(os.getpid(), signal.SIGINT)
 
@@ -218,7 +223,9 @@ def test_without_a_camera_attitude_is_published_until_ctrl_c_and_the_folder_is_c
     assert np.isinf(told[-1]["sigma_m"])
     assert metrics["frames"] == 0 and metrics["live"]["counters"]["samples"] > 100
     assert any("no camera" in warning for warning in metrics["warnings"])
-    assert "gyro_bias_rad_s" in metrics["live"]["power_up"]
+    zero = metrics["live"]["power_up"]
+    assert zero["tilt_deg"] < 1.0
+    np.testing.assert_allclose(BiasMemory.read(memory, 64).at(25.0), zero["gyro_bias_rad_s"])
     files = {path.name for path in out.iterdir()}
     assert files >= {"manifest.json", "config.json", "metrics.json", "tracking.csv", "session.db", "run.rrd"}
     stored = Session(out / "session.db")
