@@ -21,6 +21,7 @@ from vislam.vision.two_view import epipolar_distances, refine_two_view
 
 _RESTING_FRAMES = 18  # enough for a first state
 _FRAMES = 60
+_TRACKS, _FEATURES = 80, 300  # enough to be located and to verify loops; more cost time before sensors are read
 _FRAME_NS = 50_000_000
 _WINDOW = 6  # keyframes
 _SPACING = 0.25  # of the usual distance between keyframes
@@ -62,8 +63,12 @@ def rehearse(config: Config, rig: Rig, noise: ImuNoise) -> None:
 
 
 def _patient(config: Config) -> Config:
-    """Return settings by which what is made up is never given up for want of a start."""
-    return replace(config, init=replace(config.init, give_up_s=_FRAMES * _FRAME_NS * 1e-9 + 1.0))
+    """Return settings by which what is made up is never given up for want of a start, and of which little is seen."""
+    init = replace(config.init, give_up_s=_FRAMES * _FRAME_NS * 1e-9 + 1.0)
+    tracks = min(config.frontend.max_tracks, _TRACKS)
+    features = min(config.frontend.described_features, _FEATURES)
+    frontend = replace(config.frontend, max_tracks=tracks, described_features=features)
+    return replace(config, init=init, frontend=frontend)
 
 
 def _see_direction() -> None:
