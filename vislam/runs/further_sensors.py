@@ -18,7 +18,6 @@ from vislam.datasets.tables import Problems
 from vislam.sensors import Suite
 from vislam.sensors.simulated import drawn_readings
 from vislam.sensors.toml import SensorSetup, load_sensor_setup
-from vislam.sensors.true_path import bodies_on
 
 Value = ImuSample | MagSample | Frame
 _EDGE_NS = 100_000_000  # of a truth, at which its rates are not known well
@@ -78,6 +77,8 @@ def drawn(recording: Recording, setup: SensorSetup, seed: int) -> list[list[Read
     """
     if not setup.simulated_hz:
         return []
+    from vislam.sensors import bodies_on  # it loads scipy's splines, which take 0.1 s
+
     truth = recording.truth()
     if truth is None:
         raise DataError(f"{recording.name} has no truth on which sensors can be drawn; give them files")
