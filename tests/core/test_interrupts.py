@@ -95,7 +95,7 @@ def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: P
     rng = random.Random(SEED)
     print("seed", SEED)
     out = tmp_path / "corridor"
-    arguments = ["simulate", "corridor-loop", "--duration-s", "2", "--image-width-px", "320", "--out"]
+    arguments = ["simulate", "corridor-loop", "--duration-s", "1", "--image-width-px", "160", "--out"]
     whole_s, process = 0.0, started([*arguments, str(tmp_path / "whole")])
     while process.poll() is None:
         whole_s = max(whole_s, cpu_s(psutil.Process(process.pid)))
