@@ -17,6 +17,7 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.geometry import so3_exp
+from vislam.core.jackknife import jackknife_variances
 from vislam.core.messages import Array
 from vislam.vision.locate import pnp
 
@@ -118,13 +119,12 @@ def fit_focal(
         -np.linalg.solve(H.sum(axis=0) - one + prior, g.sum(axis=0) - part + prior @ shared)
         for one, part in zip(H, g, strict=True)
     ])  # fmt: skip
-    n = len(views)
-    sigma = np.sqrt((n - 1) / n * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    sigma = np.sqrt(jackknife_variances(left_out))
     factor = 1.0 / (1.0 + float(shared[0]))
     turns = [np.arccos(np.clip(0.5 * (np.trace(T[:3, :3]) - 1.0), -1.0, 1.0)) for T in T_b_as]
     return FocalFit(
-        factor, float(sigma[0]) * factor**2, float(shared[1]), float(sigma[1]), shared[2:4], -float(shared[4]), n,
-        sum(len(a.xyr) for a, _ in views), float(np.rad2deg(np.median(turns))),
+        factor, float(sigma[0]) * factor**2, float(shared[1]), float(sigma[1]), shared[2:4], -float(shared[4]),
+        len(views), sum(len(a.xyr) for a, _ in views), float(np.rad2deg(np.median(turns))),
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from vislam.calibration.cameras.board import View
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import se3_exp, so3_exp, transform
+from vislam.core.jackknife import jackknife_variances, moves_without
 from vislam.core.messages import Array, Bools
 
 Model = Literal["radtan", "radtan5", "equidistant"]
@@ -217,10 +218,8 @@ def _judge(camera: Camera, poses: list[Array], views: list[View], good: list[Boo
     squares = float(sum(block.r @ block.r for block in blocks))
     rows = sum(len(block.r) for block in blocks)
     white = squares / max(rows - len(H) - 6 * len(views), 1) * np.linalg.inv(H)
-    moves = np.array([np.linalg.lstsq(H - block.H, block.g, rcond=None)[0] for block in blocks])
-    moves -= moves.mean(axis=0)
-    jackknife = (len(views) - 1) / len(views) * np.sum(moves**2, axis=0)
-    grouping = max(1.0, float(np.median(jackknife / np.diag(white))))
+    moves = moves_without(H, np.array([block.H for block in blocks]), np.array([block.g for block in blocks]))
+    grouping = max(1.0, float(np.median(jackknife_variances(moves) / np.diag(white))))
     residuals = []
     for T, view, g in zip(poses, views, good, strict=True):
         r = _residuals(camera, T, view)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from vislam.calibration.extrinsics.visual_rotation import RotationPair
 from vislam.core.geometry import so3_exp
+from vislam.core.jackknife import jackknife_variances, moves_without
 from vislam.core.messages import Array
 from vislam.imu.gyro_turns import SeenTurns, integrated, turn_errors, turns_between
 
@@ -90,19 +91,13 @@ def _judge(
     white = np.linalg.inv(H) if regular else np.full((7, 7), np.inf)
     key_s = problem.seen.key_s
     block = np.minimum((key_s - key_s[0]) / max(np.ptp(key_s), 1e-9) * _BLOCKS, _BLOCKS - 1)
-    moves = []
-    for b in range(_BLOCKS):
-        these = block.astype(int) == b
-        if not regular or not these.any():
-            continue
-        Hb = np.einsum("n,nia,nib->ab", weights[these], J[these], J[these])
-        gb = np.einsum("n,nia,ni->a", weights[these], J[these], r[these])
-        moves.append(np.linalg.lstsq(H - Hb, gb, rcond=None)[0])
+    groups = [these for b in range(_BLOCKS) if (these := block.astype(int) == b).any()]
     grouping = 1.0
-    if len(moves) > 4:
-        spread = np.array(moves) - np.mean(moves, axis=0)
-        jackknife = (len(moves) - 1) / len(moves) * np.sum(spread**2, axis=0)
-        grouping = max(1.0, float(np.mean((jackknife / np.diag(white))[:4])))
+    if regular and len(groups) > 4:
+        informations = [np.einsum("n,nia,nib->ab", weights[g], J[g], J[g]) for g in groups]
+        gradients = [np.einsum("n,nia,ni->a", weights[g], J[g], r[g]) for g in groups]
+        spread = jackknife_variances(moves_without(H, np.array(informations), np.array(gradients)))
+        grouping = max(1.0, float(np.mean((spread / np.diag(white))[:4])))
     if regular:  # from the camera's axes, in which the rotation is perturbed, to the body's
         to_body = np.eye(7)
         to_body[:3, :3] = R

@@ -9,6 +9,7 @@ from scipy.stats import t as student
 
 from vislam.calibration.self_calibration.adjust import reduce_all
 from vislam.calibration.self_calibration.lens_search import Solution
+from vislam.core.jackknife import jackknife_variances, moves_without
 from vislam.core.messages import Array
 
 _ONE_SIGMA = 0.8413  # of a normal distribution
@@ -32,9 +33,8 @@ class Certainty:
 def certainty(solution: Solution, widened: float = 1.0) -> Certainty:
     """Return how sure a solution is; infinite where nothing is determined.
 
-    A jackknife of one step over the stretches (Efron 1982): tracks of one stretch share errors, so that pixels taken
-    for independent promise too much. Each unknown is widened by what the stretches show of it, at least by the median
-    of all, for few stretches by Student's t, and `widened` times for what all stretches share.
+    A jackknife of one step over the stretches. Each unknown is widened by what the stretches show of it, at least by
+    the median of all, for few stretches by Student's t, and `widened` times for what all stretches share.
     """
     parts = reduce_all(solution.pieces, solution.shared, solution.sigma_px)
     free = solution.shared.free
@@ -51,11 +51,9 @@ def left_out(prior: Array, informations: Array, gradients: Array, widened: float
     if n < 3 or not np.linalg.cond(H / np.sqrt(np.outer(np.diag(H), np.diag(H)))) < 1e12:
         return nothing
     white = np.linalg.inv(H)
-    moves = np.array(
-        [np.linalg.lstsq(H - one, -g, rcond=None)[0] for one, g in zip(informations, gradients, strict=True)]
-    )
+    moves = moves_without(H, informations, -gradients)
+    ratio = jackknife_variances(moves) / np.diag(white)
     moves -= moves.mean(axis=0)
-    ratio = (n - 1) / n * np.sum(moves**2, axis=0) / np.diag(white)
     grouping = max(1.0, float(np.median(ratio)))
     wider = np.sqrt(np.maximum(ratio, grouping)) * student.ppf(_ONE_SIGMA, n - 1) * widened
     return Certainty(white * np.outer(wider, wider), moves, grouping, wider)
