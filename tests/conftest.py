@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from contextlib import suppress
+from functools import lru_cache
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
@@ -18,6 +19,7 @@ from hypothesis import settings
 
 from browser import FLAGS
 from needs import missing
+from vislam.sim.worlds import simulation
 
 TESTS = Path(__file__).resolve().parent
 REPOSITORY = TESTS.parent
@@ -51,6 +53,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.resolve().relative_to(TESTS).as_posix() not in QUICK:
             item.add_marker("slow")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def painted_once() -> Iterator[None]:
+    """Keep the newest simulated world: the tests of a file open one again and again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, "painted", lru_cache(maxsize=1)(simulation.painted))
+        yield
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import Field
 
 from vislam.core.camera import Rig
 from vislam.core.messages import Array
 from vislam.sim.motion.path import rounded_path
-from vislam.sim.scene import Scene, bake
+from vislam.sim.scene import Scene, painted
 from vislam.sim.worlds import hall
 from vislam.sim.worlds.table import WORLDS, make_rig
 
@@ -42,8 +41,7 @@ def virtual_rig(options: PlaceOptions) -> Rig:
 
 def make_scene(seed: int) -> Scene:
     """Return the painted workshop; takes seconds."""
-    layout, paint = np.random.SeedSequence(seed).spawn(2)
-    return bake(hall.build(np.random.default_rng(layout)), paint)
+    return painted(hall.build, seed)
 
 
 def course(laps: int) -> Array:

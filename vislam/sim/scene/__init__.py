@@ -4,7 +4,7 @@ Compiled by hand: 510 lines. No peer has been measured. To be dropped for a rend
 no display, and gives exact depth and a pose per image row.
 """
 
-from vislam.sim.scene.bake import bake
+from vislam.sim.scene.bake import painted
 from vislam.sim.scene.names import NAMES, Hung
 from vislam.sim.scene.render import Renderer
 from vislam.sim.scene.scene import Painter, Scene, SceneBuilder
@@ -16,5 +16,5 @@ __all__ = [
     "Renderer",
     "Scene",
     "SceneBuilder",
-    "bake",
+    "painted",
 ]

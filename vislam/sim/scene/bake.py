@@ -7,7 +7,7 @@ the texture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -178,6 +178,12 @@ def _levels(image: ImageU8) -> list[ImageU8]:
         size = (max(1, width // 2), max(1, height // 2))
         levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))
     return [cv2.cvtColor(level, cv2.COLOR_BGR2BGRA) for level in levels]
+
+
+def painted(build: Callable[[np.random.Generator], SceneBuilder], seed: int) -> Scene:
+    """Return a world, laid out by `build` and painted; takes seconds, and is the same each time."""
+    layout, paint = np.random.SeedSequence(seed).spawn(2)
+    return bake(build(np.random.default_rng(layout)), paint)
 
 
 def bake(builder: SceneBuilder, seed: np.random.SeedSequence, threads: int = 2) -> Scene:

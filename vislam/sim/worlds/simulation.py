@@ -23,7 +23,7 @@ from vislam.core.messages import Array, Frame, ImageF32, ImageU8, ImuSample, Mag
 from vislam.imu import ImuNoise
 from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import NAMES, Renderer, Scene, bake
+from vislam.sim.scene import NAMES, Renderer, Scene, painted
 from vislam.sim.sensing import DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
 from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, make_rig
 from vislam.trajectory import Trajectory
@@ -142,8 +142,7 @@ class Simulation:
     @cached_property
     def scene(self) -> Scene:
         """The painted world; made on first use (a few seconds)."""
-        layout, paint = np.random.SeedSequence(self.options.world_seed).spawn(2)
-        return bake(self._world.build(np.random.default_rng(layout)), paint)
+        return painted(self._world.build, self.options.world_seed)
 
     @cached_property
     def _renderers(self) -> list[Renderer]:
