@@ -40,6 +40,13 @@ class Edited:
         return self._edit(self._recording.events())
 
 
+def without(kind, begin_s, end_s, recording):
+    """A recording that lacks one kind of value for a while."""
+    start_ns = next(v.t_ns for v in recording.events())
+    is_in = lambda v: isinstance(v, kind) and begin_s < (v.t_ns - start_ns) * 1e-9 < end_s  # noqa: E731
+    return Edited(recording, lambda events: (value for value in events if not is_in(value)))
+
+
 def run(recording, out, **settings):
     prepare(out, overwrite=False)
     config = load(None, {**FAST, **{name.replace("__", "."): value for name, value in settings.items()}})
@@ -129,14 +136,7 @@ def test_other_rigs_find_the_trajectory(rig, tmp_path):
 
 
 def test_the_imu_bridges_three_seconds_without_images(small_room, tmp_path):
-    start_ns = next(v.t_ns for v in small_room.events())
-
-    def blind(events):
-        for value in events:
-            if not (isinstance(value, Frame) and 3.0 < (value.t_ns - start_ns) * 1e-9 < 6.0):
-                yield value
-
-    metrics = run(Edited(small_room, blind), tmp_path / "run")
+    metrics = run(without(Frame, 3.0, 6.0, small_room), tmp_path / "run")
     lost = metrics["counters"]["front"]["frames_lost"]
     tracking = (tmp_path / "run" / "tracking.csv").read_text()
     assert lost >= 1 or "relocalised" in tracking
@@ -146,14 +146,7 @@ def test_the_imu_bridges_three_seconds_without_images(small_room, tmp_path):
 
 
 def test_an_imu_hole_of_one_second_is_counted_and_survived(small_room, tmp_path):
-    start_ns = next(v.t_ns for v in small_room.events())
-
-    def deaf(events):
-        for value in events:
-            if not (isinstance(value, ImuSample) and 4.0 < (value.t_ns - start_ns) * 1e-9 < 5.0):
-                yield value
-
-    metrics = run(Edited(small_room, deaf), tmp_path / "run", map__enabled=False)
+    metrics = run(without(ImuSample, 4.0, 5.0, small_room), tmp_path / "run", map__enabled=False)
     assert metrics["counters"]["front"]["imu_outages"] > 0
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.05
     assert metrics["coverage_frames"] == 1.0
