@@ -4,7 +4,7 @@ import numpy as np
 
 from vislam.core.geometry import so3_exp, transform
 from vislam.core.memory import EdgeRecord, GravityRecord
-from vislam.factors.shared import SharedErrors
+from vislam.factors.window import SharedErrors
 
 
 def drive(sigma: float, count: int = 50) -> tuple[SharedErrors, np.ndarray]:

@@ -11,9 +11,9 @@ from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.layer_files import write_layer
 from vislam.mapping.semantic.votes import voxel_keys
-from vislam.runs.report.label_data import label_data
 from vislam.runs.report.run_files import read_run
 from vislam.runs.report.scene import build_scene
+from vislam.runs.report.view_data import label_data
 
 CLASSES = LabelClasses.of({str(i): f"class {i}" for i in range(1, 31)}, "test")
 

@@ -14,7 +14,7 @@ from vislam.factors.keys import V, X, nearest_rigid
 from vislam.factors.loop import LoopModel
 from vislam.factors.odometry import Odometry
 from vislam.factors.sensed import Readings
-from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS, optimize
+from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS
 from vislam.graph.estimate import Ids
 from vislam.graph.ladder import Ladder
 from vislam.graph.records import Records, graph_of
@@ -254,7 +254,7 @@ class Estimator:
                 break
         now, loops = self._ladder.completed(self.values), self.loops | self.spare
         records = self._records
-        found = settled(lambda v: records.whole(v, loops, as_measured=True), now, records.readings, optimize)
+        found = settled(lambda v: records.whole(v, loops, as_measured=True), now, records.readings)
         if found.failure or not found.cost < found.cost_before:
             why = f"failed: {found.failure}" if found.failure else f"reached {found.cost:.6g}"
             return f"{note}kept {self.solver_name} at cost {found.cost_before:.6g}, batch {why}"

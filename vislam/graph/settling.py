@@ -7,15 +7,12 @@ from typing import NamedTuple
 
 import gtsam
 
-from vislam.factors.builder import Label
 from vislam.factors.sensed import Readings
-from vislam.factors.solvers import FAILURES
+from vislam.factors.solvers import FAILURES, optimize
+from vislam.graph.records import Whole
 
 BATCH_ITERATIONS = 50
 _ROUNDS, _GAIN = 3, 1e-4  # in which readings are linearised anew, at most; a smaller relative gain ends them
-
-Optimizer = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values, int], gtsam.Values]
-Whole = tuple[gtsam.NonlinearFactorGraph, list[Label | None]]  # all factors, with their names
 
 
 class Settled(NamedTuple):
@@ -27,9 +24,7 @@ class Settled(NamedTuple):
     failure: str  # empty: gtsam found one
 
 
-def settled(
-    whole: Callable[[gtsam.Values], Whole], values: gtsam.Values, readings: Readings, optimize: Optimizer
-) -> Settled:
+def settled(whole: Callable[[gtsam.Values], Whole], values: gtsam.Values, readings: Readings) -> Settled:
     """Return the batch solution from `values`, at which `whole` builds all factors; it may cost more.
 
     Readings count as they are, not as linearised.

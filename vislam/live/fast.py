@@ -58,7 +58,6 @@ class FastPath:
         self.counters = {"samples": 0, "rests_without_vision": 0, "wheels_without_vision": 0, "rebases": 0}
         self._config = config
         self._noise = noise
-        self._T_body_camera = T_body_camera
         self._publish = publish
         self._ekf = Ekf(config.ekf, noise, config.machine, T_body_camera, suite)
         self._buffer = ImuBuffer(config.imu, config.machine)

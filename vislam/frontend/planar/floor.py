@@ -184,7 +184,6 @@ class Regions:
     def __init__(self, config: PlanarConfig, camera: Camera, mount: Mount) -> None:
         """Divide the image of a camera at its horizon."""
         self._config = config
-        self._camera = camera
         ahead = mount.R_level_cam.T @ np.array([[1.0], [0.0], [0.0]])
         row = -1.0 if ahead[2, 0] <= 0.0 else float(camera.project(ahead.T)[0, 1])
         self.horizon_px = float(np.clip(np.nan_to_num(row, nan=-1.0), 0.0, camera.height - 1.0))

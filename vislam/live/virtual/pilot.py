@@ -12,6 +12,7 @@ from vislam.core.messages import Array
 from vislam.live.wire.slot import SlotReader, SlotWriter
 
 _COMMAND = struct.Struct("<2d")
+_SPEED_M_S, _AHEAD_M = 0.6, 0.45  # of a driver who knows the way, and how far ahead he looks
 
 
 class CommandWriter:
@@ -60,12 +61,10 @@ class CommandReader:
 class PathFollower:
     """Pure pursuit of a polyline, with a speed that bends and the end allow (Coulter, CMU-RI-TR-92-01)."""
 
-    def __init__(self, xy_m: Array, speed_m_s: float = 0.6, ahead_m: float = 0.45, is_loop: bool = False) -> None:
-        """Take a dense path [N, 2]; a loop is driven for ever."""
+    def __init__(self, xy_m: Array) -> None:
+        """Take a dense path [N, 2]."""
         self.xy_m = xy_m
-        self._speed, self._ahead, self._is_loop = speed_m_s, ahead_m, is_loop
-        ends = np.vstack([xy_m, xy_m[:1]]) if is_loop else xy_m
-        self._arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
+        self._arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
         self._at = 0
 
     @property
@@ -81,29 +80,22 @@ class PathFollower:
         """Return speed, rate and whether the end is reached, at a pose."""
         window, offsets = self._near(x_m, y_m)
         self._at = int(window[int(np.argmin(np.linalg.norm(offsets, axis=1)))])
-        left_m = np.inf if self._is_loop else self._arc[len(self.xy_m) - 1] - self._arc[self._at]
+        left_m = self._arc[-1] - self._arc[self._at]
         if left_m < 0.05:
             return 0.0, 0.0, True
         goal = self._goal()
         dx, dy = goal[0] - x_m, goal[1] - y_m
         bearing = (np.arctan2(dy, dx) - yaw_rad + np.pi) % (2.0 * np.pi) - np.pi
         curvature = 2.0 * np.sin(bearing) / max(float(np.hypot(dx, dy)), 1e-3)
-        speed = min(self._speed, float(np.sqrt(2.0 * 0.4 * left_m)), 0.5 / max(abs(curvature), 1e-6))
+        speed = min(_SPEED_M_S, float(np.sqrt(2.0 * 0.4 * left_m)), 0.5 / max(abs(curvature), 1e-6))
         if abs(bearing) > 1.0:  # turn on the spot first
             return 0.0, float(np.clip(1.5 * bearing, -0.8, 0.8)), False
         return speed, speed * curvature, False
 
     def _near(self, x_m: float, y_m: float) -> tuple[NDArray[np.int64], Array]:
-        count = len(self.xy_m)
-        window = np.arange(self._at - 20, self._at + 80)
-        window = window % count if self._is_loop else np.clip(window, 0, count - 1)
+        window = np.clip(np.arange(self._at - 20, self._at + 80), 0, len(self.xy_m) - 1)
         return window, self.xy_m[window] - np.array([x_m, y_m])
 
     def _goal(self) -> Array:
-        wanted = self._arc[self._at] + self._ahead
-        if self._is_loop:
-            wanted %= self._arc[-1]
-        place = int(np.searchsorted(self._arc, wanted)) % len(self.xy_m) if self._is_loop else None
-        if place is None:
-            place = min(int(np.searchsorted(self._arc, wanted)), len(self.xy_m) - 1)
-        return np.asarray(self.xy_m[place])
+        place = int(np.searchsorted(self._arc, self._arc[self._at] + _AHEAD_M))
+        return np.asarray(self.xy_m[min(place, len(self.xy_m) - 1)])

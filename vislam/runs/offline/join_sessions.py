@@ -65,9 +65,7 @@ class JoinedSessions:
     summary: dict[str, Any]
 
 
-def join_sessions(
-    paths: Sequence[Path], config: PoseGraphConfig | None = None, progress: Progress | None = None
-) -> JoinedSessions:
+def join_sessions(paths: Sequence[Path], progress: Progress | None = None) -> JoinedSessions:
     """Find loops between sessions (run folders or session files, only read) and optimise all of them as one graph.
 
     Loops between sessions are the only edges that may be found false. Deterministic. Raises UsageError for sessions
@@ -76,7 +74,7 @@ def join_sessions(
     parts = _read(paths)
     search = _Search(parts)
     models, inliers = search.run(progress)
-    return _optimised(parts, search, models, inliers, config or PoseGraphConfig())
+    return _optimised(parts, search, models, inliers, PoseGraphConfig())
 
 
 def write_joined(joined: JoinedSessions, out: Path) -> None:

@@ -16,22 +16,25 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.loop import caption
 from vislam.mapping.formats.ply import read_ply
-from vislam.runs.report.label_data import label_data
+from vislam.mapping.semantic.layer_files import CLASSES_NAME, read_layer
 from vislam.runs.report.page_assets import floats, packed
 from vislam.runs.report.run_files import RunFiles
 from vislam.runs.report.scene import Scene, loop_ends
 from vislam.runs.report.thumbnails import Thumbnails, read_thumbnails
 
-MAX_POINTS = 350_000  # of the map: 3.7 MB of page
+_MAX_POINTS = 350_000  # of the map: 3.7 MB of page
 _MAX_CLOUD_BYTES = 4 * 2**30
 _MAX_PATH = 4000  # poses of a line
 _MAX_LOOPS = 2000
 _MAX_TEXT = 400  # letters of one reason
 _FAR_QUANTILE = 0.002  # points beyond it on either side do not decide how large the picture is
 _STATES = ("ok", "degraded", "lost")
+MAX_VOXELS = 120_000  # 1 MB of page
+_MAX_CLASSES = 16  # with a colour and a switch of their own
+_REST = {"name": "all other labels", "color": [128, 128, 128]}
 
 
-def view_data(run: RunFiles, scene: Scene, most_points: int = MAX_POINTS) -> dict[str, Any]:
+def view_data(run: RunFiles, scene: Scene) -> dict[str, Any]:
     """Return the data of the view, ready for JSON; empty where there is no path to stand on.
 
     Times are seconds since the start of the run, positions metres in the scene's frame. What cannot be read is left
@@ -59,7 +62,7 @@ def view_data(run: RunFiles, scene: Scene, most_points: int = MAX_POINTS) -> dic
         },
         "tracking": _tracking(run, scene),
         "loops": _loops(run, scene),
-        "cloud": _cloud(run, scene, most_points),
+        "cloud": _cloud(run, scene),
         "voxels": label_data(run, scene),
         **_pictures(pictures, scene),
     }
@@ -122,7 +125,7 @@ def _loops(run: RunFiles, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _cloud(run: RunFiles, scene: Scene, most: int) -> dict[str, Any]:
+def _cloud(run: RunFiles, scene: Scene) -> dict[str, Any]:
     """Return the map's points in an order of which every beginning is an even sample of the whole."""
     path = run.folder / "map" / "cloud.ply"
     if not path.is_file():
@@ -137,7 +140,7 @@ def _cloud(run: RunFiles, scene: Scene, most: int) -> dict[str, Any]:
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     if not len(finite):
         return {}
-    chosen = finite[np.random.default_rng(0).permutation(len(finite))[:most]]
+    chosen = finite[np.random.default_rng(0).permutation(len(finite))[:_MAX_POINTS]]
     S = scene.S_scene_map
     placed = points[chosen].astype(np.float64) @ S[:3, :3].T + S[:3, 3]
     low, high = placed.min(axis=0), placed.max(axis=0)
@@ -165,3 +168,43 @@ def _pictures(pictures: Thumbnails, scene: Scene) -> dict[str, Any]:
         "camera": None if T is None else T.tolist(),
         "keyframes": floats(scene.seconds(pictures.t_ns)),
     }
+
+
+def label_data(run: RunFiles, scene: Scene, most: int = MAX_VOXELS) -> dict[str, Any]:
+    """Return classes with their voxels in the scene's frame, the largest first; empty where a map has no labels.
+
+    What cannot be read is left out and named in `run.unread`.
+    """
+    folder = run.folder / "map"
+    if not (folder / CLASSES_NAME).is_file():
+        return {}
+    try:
+        layer = read_layer(folder)
+    except DataError as error:
+        run.unread[f"map/{CLASSES_NAME}"] = str(error)
+        return {}
+    if len(layer) == 0:
+        return {}
+    chosen = np.random.default_rng(0).permutation(len(layer))[:most]
+    labels, S = layer.labels[chosen], scene.S_scene_map
+    placed = layer.points_m[chosen].astype(np.float64) @ S[:3, :3].T + S[:3, 3]
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    step = np.maximum(high - low, 1e-6) / 65535.0
+    cells = np.rint((placed - low) / step)
+    ids, counts = np.unique(labels, return_counts=True)
+    order = ids[np.argsort(-counts, kind="stable")].tolist()
+    classes = [(_named(layer.classes[i].name, layer.classes[i].color), labels == i) for i in order[:_MAX_CLASSES]]
+    if rest := order[_MAX_CLASSES:]:
+        classes.append((_REST, np.isin(labels, rest)))
+    return {
+        "count": len(chosen),
+        "of": len(layer),
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "size": layer.resolution_m * float(np.cbrt(abs(np.linalg.det(S[:3, :3])))),
+        "classes": [{**named, "xyz": packed(cells[there], "<u2")} for named, there in classes],
+    }
+
+
+def _named(name: str, color: tuple[int, int, int]) -> dict[str, Any]:
+    return {"name": name, "color": list(color)}
