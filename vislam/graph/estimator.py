@@ -19,7 +19,7 @@ from vislam.graph.estimate import Ids
 from vislam.graph.ladder import Ladder
 from vislam.graph.records import Records, graph_of
 from vislam.graph.segments import Segment, SummedUp
-from vislam.graph.settling import settled
+from vislam.graph.settling import let_in, settled
 
 _FINISH_ITERATIONS = 10  # most steps of the final convergence before batch has its try
 _CONVERGED_M = 1e-5  # largest change of a step that finish takes for convergence; rad and m alike
@@ -178,24 +178,18 @@ class Estimator:
     def close(self, fresh: list[LoopModel], batch: bool, gentle: bool = False) -> str:
         """Take loops: first without a kernel, so that the estimate reaches them, then under the Cauchy kernel.
 
-        A kernel from the start would leave a single loop after a long drift in the flat tail. `batch` starts from a
-        batch solution, for corrections too large for incremental steps. `gentle` takes one step under the kernel, for
-        loops that fit already, so that work stays small on long runs. Returns what went wrong.
+        `batch` starts from a batch solution, for corrections too large for incremental steps. `gentle` takes one step
+        under the kernel, for loops that fit already, so that work stays small on long runs. Returns what went wrong.
         """
         if batch:
             return self._ladder.begin_again(self.values, fresh, from_batch=True)
-        nothing = gtsam.Values()
-        robust = graph_of([edge.factor(robust=True) for edge in fresh])
         try:
             if gentle:
-                slots = self._ladder.solver.update(robust, nothing, [])
+                robust = graph_of([edge.factor(robust=True) for edge in fresh])
+                slots = self._ladder.solver.update(robust, gtsam.Values(), [])
                 self._ladder.take_some()
             else:
-                plain = graph_of([edge.factor(robust=False) for edge in fresh])
-                slots = self._ladder.solver.update(plain, nothing, [])
-                self._ladder.solver.iterate(LOOP_ITERATIONS)
-                slots = self._ladder.solver.update(robust, nothing, slots)
-                self._ladder.solver.iterate(1)
+                slots = let_in(self._ladder.solver, fresh)
                 self._ladder.take()
         except FAILURES as error:
             return self._ladder.recover(self.values, fresh, error)

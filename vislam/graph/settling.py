@@ -1,15 +1,16 @@
-"""The batch solution of a whole graph, and whether it is better than where it began."""
+"""How a solver comes to rest: with new loops, and from there in batch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import gtsam
 
+from vislam.factors.loop import LoopModel
 from vislam.factors.sensed import Readings
-from vislam.factors.solvers import FAILURES, optimize
-from vislam.graph.records import Whole
+from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS, Solver, optimize
+from vislam.graph.records import Whole, graph_of
 
 BATCH_ITERATIONS = 50
 _ROUNDS, _GAIN = 3, 1e-4  # in which readings are linearised anew, at most; a smaller relative gain ends them
@@ -22,6 +23,18 @@ class Settled(NamedTuple):
     cost_before: float
     cost: float
     failure: str  # empty: gtsam found one
+
+
+def let_in(solver: Solver, loops: Sequence[LoopModel]) -> list[int]:
+    """Add loops first without a kernel, so that the estimate reaches them, then under it; return their slots.
+
+    A kernel from the start would leave a single loop after a long drift in the flat tail. Raises one of FAILURES.
+    """
+    plain = solver.update(graph_of([loop.factor(robust=False) for loop in loops]), gtsam.Values(), [])
+    solver.iterate(LOOP_ITERATIONS)
+    slots = solver.update(graph_of([loop.factor(robust=True) for loop in loops]), gtsam.Values(), plain)
+    solver.iterate(1)
+    return slots
 
 
 def settled(whole: Callable[[gtsam.Values], Whole], values: gtsam.Values, readings: Readings) -> Settled:

@@ -25,7 +25,7 @@ from vislam.factors.solvers import (
 )
 from vislam.graph.measurements import ImuBetween, Measurement
 from vislam.graph.records import graph_of
-from vislam.graph.settling import BATCH_ITERATIONS, short
+from vislam.graph.settling import BATCH_ITERATIONS, let_in, short
 
 _IMU_ROUNDS = 3  # of a batch, in which inertial data are integrated at the biases of the one before
 _LADDER: tuple[Factorization, ...] = ("CHOLESKY", "QR")
@@ -124,10 +124,7 @@ class Solution:
             return ""
         assert self._solver is not None
         try:
-            plain = self._solver.update(graph_of([loop.factor(robust=False)]), gtsam.Values(), [])
-            self._solver.iterate(LOOP_ITERATIONS)
-            slots = self._solver.update(graph_of([loop.factor(robust=True)]), gtsam.Values(), plain)
-            self._solver.iterate(1)
+            slots = let_in(self._solver, [loop])
             self.values = self._solver.estimate()
         except FAILURES as error:
             self._report(loop, LoopDecision.PENDING, "the solver refused it", chi2)
