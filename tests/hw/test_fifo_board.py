@@ -361,13 +361,12 @@ def test_stamps_increase_whatever_the_questions_find() -> None:
 @pytest.mark.parametrize("kind", ["LSM6DSOX", "MPU-6050", "GY-85"])
 def test_a_host_put_aside_anywhere_blames_no_chip(kind: Any) -> None:
     for at in range(1, 300):
-        stall_ns = (150 if at % 2 else 300) * 1_000_000
-        clock = Stalled(at, stall_ns)
+        clock = Stalled(at, (150 if at % 2 else 300) * 1_000_000)
         make = emulated_gy85 if kind == "GY-85" else partial(emulated_board, kind, magnetometer="none")
         with emulated_bus(make(still, clock.now_ns)) as bus:
             fifo, gy85 = BoardConfig(bus=bus.path), Gy85Config(bus=bus.path, mag=False, self_test=False)
             driver = Gy85(gy85, clock) if kind == "GY-85" else FifoBoard(fifo, clock)
-            end_ns, count = clock.now_ns() + stall_ns + 200_000_000, 0
+            end_ns, count = clock.now_ns() + clock.stall_ns + 200_000_000, 0
             while clock.now_ns() < end_ns:
                 count += len(driver.read(0.1))
             counters = driver.counters()

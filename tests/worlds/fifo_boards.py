@@ -48,11 +48,11 @@ class Stalled(SteppedClock):
 
     def __init__(self, at: int, stall_ns: int) -> None:
         super().__init__()
-        self._left, self._stall_ns = at, stall_ns
+        self._left, self.stall_ns = at, stall_ns
 
     def now_ns(self) -> int:
         self._left -= 1
-        self.advance(self._stall_ns if self._left == 0 else 5_000)
+        self.advance(self.stall_ns if self._left == 0 else 5_000)
         return super().now_ns()
 
 
