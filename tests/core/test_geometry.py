@@ -102,3 +102,16 @@ def test_alignment_recovers_a_similarity(xi, scale, seed):
 def test_alignment_refuses_too_few_points():
     with pytest.raises(ValueError, match="at least 3 pairs"):
         g.align_points(np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+def test_a_rigid_motion_is_finite_orthonormal_not_mirrored_and_nothing_else():
+    T = np.tile(g.se3_exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0])), (7, 1, 1))
+    T[1, :3, 0] *= -1.0
+    T[2, :3, :3] *= 1.01
+    T[3, 0, 1] = np.nan
+    T[4, 1, 3] = np.inf
+    T[5, 3, 0] = 0.1
+    T[6, 0, 0] += 1e-5
+    assert g.are_rigid(T, 1e-4).tolist() == [True, False, False, False, False, False, True]
+    assert g.are_rotations(T[:, :3, :3], 1e-6).tolist() == [True, False, False, False, True, True, False]
+    assert g.are_rigid(T[0], 1e-9) and g.are_rigid(T[:0], 1e-9).all()

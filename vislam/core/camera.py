@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rotations, invert
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 
@@ -313,8 +313,7 @@ class Rig:
         if not self.cameras or len(self.cameras) != len(self.T_body_cams):
             raise DataError(f"a rig needs one pose per camera, got {len(self.cameras)} and {len(self.T_body_cams)}")
         for index, T in enumerate(self.T_body_cams):
-            R = T[:3, :3]
-            if T.shape != (4, 4) or not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
+            if T.shape != (4, 4) or not are_rotations(T[:3, :3], 1e-3):
                 raise DataError(f"extrinsics of cam{index} are not a rigid transform: {np.asarray(T).tolist()}")
 
     def __repr__(self) -> str:

@@ -8,6 +8,7 @@ state estimation in robotics", 2018. The small functions are compiled, so that k
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError
@@ -158,6 +159,19 @@ def se3_adjoint(T: Array) -> Array:
     out[3:, 3:] = R
     out[3:, :3] = skew(T[:3, 3].copy()) @ R
     return out
+
+
+def are_rotations(R: Array, tolerance: float) -> NDArray[np.bool_]:
+    """Return which matrices [..., 3, 3] are rotations: no entry of R^T R is off by more than that, none is mirrored."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        errors = np.abs(R.swapaxes(-1, -2) @ R - np.eye(3)).max(axis=(-2, -1))
+        return np.asarray((errors <= tolerance) & (np.linalg.det(R) > 0.0))
+
+
+def are_rigid(T: Array, tolerance: float) -> NDArray[np.bool_]:
+    """Return which matrices [..., 4, 4] are finite rigid motions, as `are_rotations` judges their rotations."""
+    framed = np.isfinite(T).all(axis=(-2, -1)) & (T[..., 3, :] == [0.0, 0.0, 0.0, 1.0]).all(axis=-1)
+    return np.asarray(framed & are_rotations(T[..., :3, :3], tolerance))
 
 
 def transform_points(T: Array, points: Array) -> Array:

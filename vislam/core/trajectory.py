@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError
-from vislam.core.geometry import sim3_parts
+from vislam.core.geometry import are_rigid, sim3_parts
 from vislam.core.messages import Array
 
 _ORTHONORMAL_TOLERANCE = 1e-6  # far above the rounding of chained float64 products, far below any wrong matrix
@@ -35,7 +35,7 @@ class Trajectory:
         if len(backward):
             i = int(backward[0]) + 1
             raise DataError(f"trajectory times must increase: pose {i} at {stamps[i]} ns follows {stamps[i - 1]} ns")
-        bad = np.flatnonzero(~_is_rigid(poses))
+        bad = np.flatnonzero(~are_rigid(poses, _ORTHONORMAL_TOLERANCE))
         if len(bad):
             raise DataError(f"pose {bad[0]} at {stamps[bad[0]]} ns is not a finite rigid transform")
         object.__setattr__(self, "t_ns", stamps.astype(np.int64))
@@ -92,19 +92,6 @@ class Trajectory:
         poses[:, :3, :3] = R @ self.T_world_body[:, :3, :3]
         poses[:, :3, 3] = scale * self.positions_m @ R.T + t
         return Trajectory(self.t_ns, poses)
-
-
-def _is_rigid(poses: Array) -> NDArray[np.bool_]:
-    R = poses[:, :3, :3]
-    with np.errstate(invalid="ignore", over="ignore"):
-        gram = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        good: NDArray[np.bool_] = (
-            np.isfinite(poses).all(axis=(1, 2))
-            & (gram < _ORTHONORMAL_TOLERANCE)
-            & (np.linalg.det(np.nan_to_num(R)) > 0.0)
-            & (poses[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(axis=1)
-        )
-    return good
 
 
 def _interpolate_many(T_a: Array, T_b: Array, alpha: Array) -> Array:

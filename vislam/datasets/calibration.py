@@ -16,7 +16,7 @@ import yaml
 
 from vislam.core.camera import Camera, Distortion
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.core.reading import read_text
 from vislam.datasets.images import DepthFormat
@@ -130,8 +130,7 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
     matrix = data["T_BS"]
     holder = matrix if isinstance(matrix, dict) else {"data": matrix}
     T = np.array(numbers_in(holder, "data", path, 16)).reshape(4, 4)
-    R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
+    if not are_rotations(T[:3, :3], 1e-3):
         raise DataError(f"{path}: T_BS is not a rigid transform: {T.tolist()}")
     return T
 

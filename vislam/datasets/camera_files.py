@@ -14,7 +14,7 @@ import numpy as np
 
 from vislam.core.camera import Camera, Distortion
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_camera, read_pose
 
@@ -115,8 +115,7 @@ def _optional_pose(entry: Mapping[str, Any], key: str, path: Path) -> Array | No
     if entry.get(key) is None:
         return None
     T = np.array(numbers_in(entry, key, path, 16)).reshape(4, 4)
-    R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=_RIGID) or np.linalg.det(R) < 0.0:
+    if not are_rotations(T[:3, :3], _RIGID):
         raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
     return invert(T)
 

@@ -21,6 +21,7 @@ from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
+from vislam.core.geometry import are_rotations
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.kinds import Kinds, lacking
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
@@ -271,7 +272,7 @@ class _Run:
             raise ProgramError(f"{self._program}: {where}: {error}; a pose [4, 4] is wanted") from error
         if T.shape != (4, 4):
             raise ProgramError(f"{self._program}: {where}: a pose is an array [4, 4], not {[*T.shape]}")
-        if not np.isfinite(T).all() or np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() > _RIGID:
+        if not np.isfinite(T).all() or not are_rotations(T[:3, :3], _RIGID):
             raise ProgramError(f"{self._program}: {where}: the pose is no rigid motion: {T.round(3).tolist()}")
         return nearest_rigid(T)
 

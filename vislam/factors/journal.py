@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
+from vislam.core.geometry import are_rigid, are_rotations
 from vislam.core.memory import WindowRecord
 from vislam.core.messages import Array, ImuSpan, KeyframePacket, LoopEdge, NavState, Tracking
 from vislam.core.readings import OwnStart, PlacedReading, Station
@@ -175,11 +176,8 @@ def checked_poses(T: Sequence[Array], whats: Sequence[str]) -> Array:
         if np.shape(matrix) != (4, 4) or not np.isfinite(matrix).all():
             raise DataError(f"{what}: pose must be 4x4 and finite, got shape {np.shape(matrix)}")
     matrices = np.array(T, dtype=np.float64).reshape(-1, 4, 4)
-    R = matrices[:, :3, :3]
-    errors = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
-    broken = (errors > _RIGID) | (np.linalg.det(R) < 0.0) | (matrices[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)
-    for n in np.flatnonzero(broken).tolist():
-        raise DataError(f"{whats[n]}: pose is not a rigid motion, R^T R misses identity by {errors[n]:.3g}")
+    for n in np.flatnonzero(~are_rigid(matrices, _RIGID)).tolist():
+        raise DataError(f"{whats[n]}: pose is not a rigid motion: {matrices[n].tolist()}")
     return nearest_rigid(matrices)
 
 
@@ -231,7 +229,7 @@ def checked_starts(starts: tuple[OwnStart, ...], what: str) -> tuple[OwnStart, .
 def _check_station(station: Station, name: str) -> None:
     for key in _ROTATIONS:
         R = getattr(station, key)
-        if np.shape(R) != (3, 3) or not _are_finite(R) or np.abs(R.T @ R - np.eye(3)).max() > _RIGID:
+        if np.shape(R) != (3, 3) or not are_rotations(R, _RIGID):
             raise DataError(f"{name}: its station's {key} is no rotation")
     for key in _VECTORS:
         if np.shape(getattr(station, key)) != (3,) or not _are_finite(getattr(station, key)):

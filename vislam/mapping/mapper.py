@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vislam.config import MapConfig
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.core.geometry import are_rigid
 from vislam.core.memory import PackedScan
 from vislam.core.messages import Array, GraphUpdate, Keyframe, Submaps
 from vislam.mapping.cloud.cloud import Cloud, VoxelAverage, voxel_filter, without_outliers
@@ -364,11 +365,7 @@ def _check_rigid(T: Array, keyframe_ids: NDArray[np.int64]) -> None:
         raise DataError(
             f"the map pose of keyframe {keyframe_ids[0]} is not a rigid transform: its shape is {T.shape[1:]}"
         )
-    R = T[:, :3, :3]
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rigid = (error <= _RIGID_TOLERANCE) & (np.linalg.det(R) > 0.0)
-    rigid &= np.isfinite(T).all(axis=(1, 2)) & (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    rigid = are_rigid(T, _RIGID_TOLERANCE)
     if not rigid.all():
         first = int(np.flatnonzero(~rigid)[0])
         raise DataError(f"the map pose of keyframe {keyframe_ids[first]} is not a rigid transform: {T[first].tolist()}")

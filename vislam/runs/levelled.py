@@ -16,7 +16,7 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
-from vislam.core.geometry import transform
+from vislam.core.geometry import are_rotations, transform
 from vislam.core.messages import Array, NavState
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
@@ -210,7 +210,7 @@ def onto_map(path: Trajectory, name: str, metrics: dict[str, Any]) -> Trajectory
         R = np.array(R, dtype=np.float64).reshape(3, 3)
     except (TypeError, ValueError):
         return path  # no matrix: shown as it is
-    return path.transformed(transform(R, np.zeros(3))) if np.allclose(R @ R.T, np.eye(3), atol=1e-6) else path
+    return path.transformed(transform(R, np.zeros(3))) if are_rotations(R, 1e-6) else path
 
 
 def stored_up(info: dict[str, Any]) -> Up | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vislam.config import GraphConfig, MachineConfig
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.factors import motion
 from vislam.factors.builder import of_vision
@@ -195,7 +195,6 @@ def _duration_s(before: KeyframeRecord, record: KeyframeRecord) -> float:
 
 def _rigid(T: Array, what: str) -> Array:
     """Return a pose of the log made exactly rigid; raises DataError on damage."""
-    R = T[:3, :3]
-    if not np.all(np.isfinite(T)) or np.max(np.abs(R.T @ R - np.eye(3))) > 1e-3 or np.linalg.det(R) < 0.0:
+    if not np.isfinite(T).all() or not are_rotations(T[:3, :3], 1e-3):
         raise DataError(f"{what}: the pose in the factor log is not a rigid motion; run the recording again")
     return nearest_rigid(T)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.choice import BagOptions, Choice, ImageFacts, chosen, topics_there
@@ -235,7 +235,7 @@ def _beside(T_body_cam0: Array | None, infos: list[Any], choice: Choice) -> Arra
         np.eye(3) if _is_rectified(facts) else _matrix(info, "r", (3, 3))
         for facts, info in zip(choice.cameras, infos, strict=True)
     ]
-    good = all(np.allclose(R @ R.T, np.eye(3), atol=1e-3) for R in rotations)
+    good = are_rotations(np.array(rotations), 1e-3).all()
     if not good or not np.all(np.isfinite(P)) or P[0, 3] == 0.0 or P[0, 0] <= 0.0:
         return None
     T_cam1_cam0 = np.eye(4)  # p_rect1 = p_rect0 + (P[0, 3] / fx, 0, 0)

@@ -10,7 +10,7 @@ import numpy as np
 from vislam.config import DepthCameraConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, HardwareError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rigid, invert
 from vislam.core.messages import Array
 
 # x forward, y left, z up of the body, for a camera that looks ahead: x right, y down, z forward
@@ -95,7 +95,7 @@ def rigid(rotation: Array, translation_m: Array) -> Array:
     """Return the pose [4, 4] of cam1 in cam0 from what takes points of cam0 into cam1; HardwareError if it is none."""
     T_cam1_cam0 = np.eye(4)
     T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3] = rotation, translation_m
-    if not np.all(np.isfinite(T_cam1_cam0)) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+    if not are_rigid(T_cam1_cam0, 1e-3):
         raise HardwareError(
             f"the camera's factory extrinsics are no rigid transform: {T_cam1_cam0.tolist()}; {_NO_FILE}"
         )

@@ -15,7 +15,7 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError, UsageError
-from vislam.core.geometry import invert, invert_many, se3_adjoint, se3_exp, se3_log
+from vislam.core.geometry import are_rigid, invert, invert_many, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, ImageF32
 from vislam.vision.depth_alignment import DepthAlignment, Prior, SeenFrom, align_depth
 from vislam.vision.depth_surface import DepthSurface, SurfaceMaker
@@ -166,7 +166,7 @@ class DepthLocaliser:
 
 def _checked(T_map_body: Array) -> Array:
     T = np.asarray(T_map_body, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all() or abs(np.linalg.det(T[:3, :3]) - 1.0) > 1e-3:
+    if T.shape != (4, 4) or not are_rigid(T, 1e-3):
         raise DataError(f"a pose is a finite rigid transform [4, 4], got {T.shape}; see vislam.core.geometry.transform")
     return T
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
+from vislam.core.geometry import are_rotations
 from vislam.core.messages import Array
 from vislam.mapping.octree import query_kernels as kernels
 from vislam.mapping.octree.occupancy import Octree
@@ -92,7 +93,7 @@ def box_state(grid: Octree, centres_m: Numbers, size_m: Numbers, R_map_box: Numb
     if turn.shape not in ((3, 3), (len(centres), 3, 3)):
         raise DataError(f"boxes are turned by one or {len(centres)} rotations, got shape {turn.shape}")
     R = np.ascontiguousarray(np.broadcast_to(turn, (len(centres), 3, 3)))
-    if not np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) < 1e-6:
+    if not are_rotations(R, 1e-6).all():
         raise DataError("a box is turned by a matrix that is no rotation")
     _check_size(grid, np.full(3, float(np.linalg.norm(size))))
     return np.asarray(kernels.boxes(centres, 0.5 * size, R, grid.resolution_m, *grid.pool.arrays))

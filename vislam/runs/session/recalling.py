@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from vislam.core import collector
+from vislam.core.geometry import are_rigid
 from vislam.core.memory import (
     FrontMemory,
     GraphMemory,
@@ -95,9 +96,7 @@ def recall(session: Session) -> SlamMemory | None:
 
 def _check_rigid(T: Array) -> None:
     """Raise ValueError where one of the poses [M, 4, 4] is no rigid motion."""
-    R = T[:, :3, :3]
-    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    sound = (error <= _RIGID) & np.isfinite(T).all(axis=(1, 2)) & (T[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+    sound = are_rigid(T, _RIGID)
     if not sound.all():
         raise ValueError(f"the pose of keyframe {int(np.flatnonzero(~sound)[0])} is no rigid motion")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.config import MonoDepthConfig
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert
+from vislam.core.geometry import are_rigid, invert
 from vislam.core.messages import Array, ImageF32, ImageU8
 from vislam.mapping.depth.mono.matching import CODES, LEAST_SCORE, MARGIN, gradient_sums, grey_noise
 from vislam.mapping.depth.mono.prior import carried_over, close_gaps, flat_prior
@@ -163,11 +163,5 @@ def _check_image(image: NDArray[np.generic], shape: tuple[int, ...]) -> None:
 
 
 def _check_rigid(T: Array) -> None:
-    with np.errstate(invalid="ignore", over="ignore"):
-        rigid = (
-            T.shape == (4, 4)
-            and bool(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() <= _RIGID_TOLERANCE)
-            and bool(np.isfinite(T).all())
-        )
-    if not rigid:
+    if T.shape != (4, 4) or not are_rigid(T, _RIGID_TOLERANCE):
         raise DataError(f"the motion between two images is not a rigid transform: {T.tolist()}")
