@@ -20,7 +20,7 @@ from vislam.mapping.cloud.mesh import Mesh, fuse_mesh
 from vislam.mapping.cloud.smooth import smoothed
 from vislam.mapping.cloud.store import KeyframeStore, Scan
 from vislam.mapping.cloud.surfels import SurfelMap, Surfels
-from vislam.mapping.dense.refined_poses import refined_poses
+from vislam.mapping.dense.refine import refined_poses
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.depth.mono import LateDepth

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from vislam.core.errors import DataError
@@ -137,11 +137,6 @@ def wanted_topic(listing: Listing, role: str, name: str, types: tuple[str, ...])
     if why := why_unreadable(entry.topic):
         raise DataError(f"{role}={name}: {why}")
     return entry
-
-
-def option_names() -> str:
-    """Return the options of a bag, for errors."""
-    return ", ".join(field.name for field in fields(BagOptions))
 
 
 def _entry(

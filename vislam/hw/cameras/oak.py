@@ -13,7 +13,6 @@ from vislam.core.errors import DataError, HardwareError, install_line
 from vislam.core.messages import Array, Frame
 from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_imu, rigid
 from vislam.hw.cameras.library_camera import LibraryCamera, named
-from vislam.hw.cameras.oak_depth import colour_and_depth, colour_camera, set_exposure
 from vislam.hw.cameras.oak_imu import CM, OakClock, OakMotion, imu_pose, in_ns
 from vislam.hw.cameras.video import MAX_AGE_S
 from vislam.hw.cameras.webcam import Setting
@@ -22,6 +21,7 @@ from vislam.hw.own_imu import OwnImu
 _NEXT = timedelta(seconds=1)  # without an image for this long, the device is opened again
 _MODELS = {"Perspective": "radtan", "Fisheye": "equidistant"}
 _MM = 0.001  # in which depthai states depth
+_STEREO_SIZE = (640, 400)  # of the grey images that depth is found in; as depthai's own examples have it
 
 
 class OakStream:
@@ -51,7 +51,7 @@ class OakStream:
                 self._motion = OakMotion(self._dai, self._pipeline, self._device, config, imu, self._clock, T_cam_imu)
             if with_depth:
                 is_newer = self._device.getPlatform() == self._dai.Platform.RVC4
-                self._queues = [colour_and_depth(self._dai, self._pipeline, calibration, config, is_newer)]
+                self._queues = [_colour_and_depth(self._dai, self._pipeline, calibration, config, is_newer)]
             else:
                 self._queues = [self._queue(socket, config) for socket in _sockets(calibration, self._dai, with_depth)]
             self._pipeline.start()
@@ -95,7 +95,7 @@ class OakStream:
     def _queue(self, socket: Any, config: OakConfig) -> Any:
         """Return the queue of one camera's grey images."""
         camera = self._pipeline.create(self._dai.node.Camera).build(socket)
-        set_exposure(camera, config)
+        _set_exposure(camera, config)
         size, grey = (config.width_px, config.height_px), self._dai.ImgFrame.Type.GRAY8
         return camera.requestOutput(size, type=grey, fps=config.rate_hz).createOutputQueue(maxSize=4, blocking=False)
 
@@ -146,7 +146,7 @@ def oak_rig(config: OakConfig, with_depth: bool = False, with_imu: bool = False)
         calibration = device.readCalibration()
         sockets = _sockets(calibration, dai, with_depth)
         cameras = (
-            [colour_camera(calibration, sockets[0], config)] if with_depth else _pair(calibration, sockets, config)
+            [_colour_camera(calibration, sockets[0], config)] if with_depth else _pair(calibration, sockets, config)
         )
         T_cam_imu = imu_pose(calibration, sockets[0]) if with_imu else None
         # takes points of the left into the right
@@ -174,6 +174,48 @@ def _pair(calibration: Any, sockets: tuple[Any, ...], config: OakConfig) -> list
         pinhole = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
         cameras.append(factory_camera(size, pinhole, _MODELS.get(model, model), coefficients))
     return cameras
+
+
+def _colour_and_depth(dai: Any, pipeline: Any, calibration: Any, config: OakConfig, is_newer: bool) -> Any:
+    """Return the queue of groups of `color` and `depth` of one time.
+
+    Depth is found in the grey pair and warped into the colour image, which is freed of its distortion for that: by the
+    node of stereo depth itself, or (`is_newer`: RVC4) by one of its own.
+    """
+    node, rate = dai.node, config.rate_hz
+    sockets = calibration.getStereoLeftCameraId(), calibration.getStereoRightCameraId()
+    colour = pipeline.create(node.Camera).build(dai.CameraBoardSocket.CAM_A)
+    _set_exposure(colour, config)
+    stereo, sync = pipeline.create(node.StereoDepth), pipeline.create(node.Sync)
+    for socket, entrance in zip(sockets, (stereo.left, stereo.right), strict=True):
+        pipeline.create(node.Camera).build(socket).requestOutput(_STEREO_SIZE, fps=rate).link(entrance)
+    size, bgr = (config.width_px, config.height_px), dai.ImgFrame.Type.BGR888i
+    images = colour.requestOutput(size, type=bgr, fps=rate, enableUndistortion=True)
+    sync.setSyncThreshold(timedelta(seconds=0.5 / rate))
+    images.link(sync.inputs["color"])
+    if is_newer:
+        align = pipeline.create(node.ImageAlign)
+        stereo.depth.link(align.input)
+        images.link(align.inputAlignTo)
+        align.outputAligned.link(sync.inputs["depth"])
+    else:
+        images.link(stereo.inputAlignTo)
+        stereo.depth.link(sync.inputs["depth"])
+    return sync.out.createOutputQueue(maxSize=2, blocking=False)
+
+
+def _colour_camera(calibration: Any, socket: Any, config: OakConfig) -> Camera:
+    """Return the colour camera as its undistorted images have it: a pinhole, cut to the shape that is asked for."""
+    size = (config.width_px, config.height_px)
+    K = np.array(calibration.getCameraIntrinsics(socket, *size))
+    return factory_camera(size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), "none", ())
+
+
+def _set_exposure(camera: Any, config: OakConfig) -> None:
+    """Fix exposure and gain, where that is asked for."""
+    if config.exposure_s is not None:
+        iso = 400 if config.gain is None else round(config.gain)
+        camera.initialControl.setManualExposure(round(config.exposure_s * 1e6), iso)
 
 
 def _sockets(calibration: Any, dai: Any, with_depth: bool) -> tuple[Any, ...]:
