@@ -69,14 +69,15 @@ class DeviceClock:
     def host_ns(self, device_us: int) -> int | None:
         """Return the host time of a device stamp near the newest one, which changes nothing; None where none is known.
 
-        For what the device stamped besides, before or after it: within `step_s` of the newest stamp.
+        For what the device stamped besides, before or after it: within 0.1 s of the newest stamp, and by the same
+        slow approach to a better line, so that its intervals stay true as well.
         """
-        if self._last is None or not self._rate_known:
+        if self._last is None or self._slewed is None:
             return None
         since_us = (device_us - self._last.device_ns // 1000 + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
         if abs(since_us) > _STEP_S * 1e6:
             return None
-        return round(self._line_ns(self._last.device_ns + since_us * 1000))
+        return self._slewed[1] + round(self.rate * since_us * 1000)
 
     def _begin(self) -> None:
         self._last: _Point | None = None
