@@ -65,12 +65,9 @@ def straight() -> Driven:
     return Driven(STRAIGHT)
 
 
-def way_m(drive: Drive) -> float:
-    return float(np.linalg.norm((drive.poses[-1] - drive.poses[0])[:2, 3]))
-
-
 def options(**changes: object) -> FloorOptions:
-    return replace(FloorOptions("drive", distance_m=way_m(STRAIGHT)), **changes)  # type: ignore[arg-type]
+    way = STRAIGHT.poses[-1] - STRAIGHT.poses[0]
+    return replace(FloorOptions("drive", distance_m=float(np.linalg.norm(way[:2, 3]))), **changes)  # type: ignore[arg-type]
 
 
 def test_three_metres_tell_the_tilt_and_a_tape_the_height() -> None:
@@ -155,11 +152,6 @@ def test_the_simulated_cart_is_calibrated_within_what_it_says(simulated_cart: Ca
     """Springs, a GY-85, a camera whose clock is 30 ms late, and extrinsics that are wrong by degrees."""
     told = FloorOptions("cart", distance_m=simulated_cart.distance_m(end_s), duration_s=end_s + 0.08)
     found, true = fit_floor(simulated_cart, told), simulated_cart.mount
-    print(
-        f"{told.distance_m:.2f} m: tilt {found.tilt_deg:.3f} +- {found.tilt_sigma_deg:.3f} ({true.tilt_deg:.3f}), roll "
-        f"{found.roll_deg:.3f} +- {found.roll_sigma_deg:.3f} ({true.roll_deg:.3f}), height {found.height_m:.4f} +- "
-        f"{found.height_sigma_m:.4f} m"
-    )
     assert abs(found.tilt_deg - true.tilt_deg) < 2.5 * found.tilt_sigma_deg
     assert abs(found.roll_deg - true.roll_deg) < 2.5 * found.roll_sigma_deg
     assert abs(found.height_m - true.height_m) < 2.5 * found.height_sigma_m

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
@@ -92,14 +94,19 @@ def stamp_ns(t_s: Array) -> np.ndarray:
     return np.round(np.asarray(t_s) * 1e9).astype(np.int64) + 1_000_000_000
 
 
+@cache
+def _painted(contrast: float) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+    """Return textures of floor and walls, and the generator after them; painted once, as it takes a second."""
+    rng = np.random.default_rng(5)
+    return texture(rng, _TEXTURE_PX, 120, contrast), texture(rng, _TEXTURE_PX, 120, 50.0), rng
+
+
 class FloorWorld:
     """Draws frames of the hall."""
 
-    def __init__(self, rig_: Rig, contrast: float = 45.0, noise_grey: float = 2.0, seed: int = 5) -> None:
+    def __init__(self, rig_: Rig, contrast: float = 45.0) -> None:
         self.rig = rig_
-        self._rng = np.random.default_rng(seed)
-        self._floor, self._wall = (texture(self._rng, _TEXTURE_PX, 120, c) for c in (contrast, 50.0))
-        self._noise = noise_grey
+        self._floor, self._wall, self._rng = deepcopy(_painted(contrast))
         u, v = np.meshgrid(np.arange(320, dtype=float), np.arange(240, dtype=float))
         self._rays = rig_.cameras[0].unproject(np.column_stack([u.ravel(), v.ravel()]))
 
@@ -112,12 +119,13 @@ class FloorWorld:
         for axis, at, painted in planes:
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (at - o[axis]) / d[:, axis]
-            hit = (t > 0.01) & (t < nearest)
-            points = o + d * np.where(hit, t, 1.0)[:, None]
-            uv = (np.delete(points, axis, axis=1) * _TEXELS_PER_M + _TEXTURE_PX / 2).astype(np.float32)
+            hit = np.flatnonzero((t > 0.01) & (t < nearest))
+            across = [other for other in range(3) if other != axis]
+            uv = np.zeros((len(d), 2), np.float32)
+            uv[hit] = (o + d[hit] * t[hit, None])[:, across] * _TEXELS_PER_M + _TEXTURE_PX / 2
             sampled = cv2.remap(painted, uv.reshape(240, 320, 2), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
             grey[hit], nearest[hit] = sampled.ravel()[hit], t[hit]
-        grey += self._rng.normal(0.0, self._noise, len(grey)).astype(np.float32)
+        grey += self._rng.normal(0.0, 2.0, len(grey)).astype(np.float32)
         image = np.clip(np.round(grey), 0, 255).astype(np.uint8).reshape(240, 320)
         return cv2.GaussianBlur(image, (0, 0), 0.7)  # a lens; without it far texture flickers
 
