@@ -20,7 +20,7 @@ from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel
 from vislam.factors.sensed import Readings
 from vislam.factors.window import WindowOdometry
-from vislam.graph import PoseGraph, estimator
+from vislam.graph import PoseGraph, settling
 from vislam.graph.estimator import Estimator
 from vislam.graph.source import in_map
 from vislam.runs.session import Session, SessionWriter, recall
@@ -321,13 +321,13 @@ def test_a_loop_that_a_long_run_knows_already_is_accepted_without_a_factor(
     assert all(r.decision is LoopDecision.PENDING for r in graph.edge_reports() if r.loop_id >= 1000)
     assert redundant == Places(graph).of(LoopPlace.SPARE)
     assert all((r.weight == 0.0) == (r.loop_id in redundant) for r in true)
-    loops, whole = [], estimator.optimize
+    loops, whole = [], settling.optimize
 
     def watch(batch: gtsam.NonlinearFactorGraph, *rest: object) -> gtsam.Values:
         loops.append(sum(_is_loop(batch.at(n)) for n in range(batch.size())))
         return whole(batch, *rest)
 
-    monkeypatch.setattr(estimator, "optimize", watch)
+    monkeypatch.setattr(settling, "optimize", watch)
     graph.finish()
     assert loops == [len(true)]
     assert rmse_m(graph.poses(), world.truth) < 0.02
