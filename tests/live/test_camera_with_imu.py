@@ -71,7 +71,7 @@ class Drive:
         step = self.steps[0] if self.steps else ""
         if step == "go" and samples > 700:  # it stood still until then
             (self.folder / "go").write_text(str(time.monotonic_ns() + 1_000_000_000))
-        elif step == "unplug" and samples > self.samples + 1400 and status.get("map_revision", 0) > 5:
+        elif step == "unplug" and samples > self.samples + 2400 and status.get("map_revision", 0) > 5:
             (self.folder / "unplugged").touch()
         elif step == "missing" and word & missing == missing and (self.folder / "stopped").exists():
             (self.folder / "unplugged").unlink()
@@ -95,7 +95,7 @@ def test_one_process_owns_the_device_and_the_run_has_both(folder: Path, tmp_path
     assert camera["opened"] == imu["sensor_opened"] == 2
     assert camera["lost"] == 1
     assert metrics["frames"] <= camera["taken"] <= camera["captured"]
-    assert metrics["counters"]["imu"]["samples"] == metrics["live"]["latency_ms"]["count"] > 2000
+    assert metrics["counters"]["imu"]["samples"] == metrics["live"]["latency_ms"]["count"] > 3000
     assert imu["sensor_not_handed_on"] == 0
     # to and fro by twice the amplitude, to the right: the body's -y. The map's axes are those of the start
     poses = np.loadtxt(out / "trajectory_graph.tum")

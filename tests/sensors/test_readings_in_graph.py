@@ -36,7 +36,7 @@ PLACES = {
 }
 
 
-def a_world(seed: int, duration_s: float = 14.0) -> World:
+def a_world(seed: int, duration_s: float = 24.0) -> World:
     return World(duration_s, seed=seed, vo_sigma_rad=np.deg2rad(0.5), vo_sigma_m=0.02)
 
 
@@ -116,7 +116,7 @@ def fake_window(monkeypatch: pytest.MonkeyPatch) -> Callable[[World], None]:
 
 def test_pose_and_own_variables_are_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
     watched, errors = WatchedSolvers(monkeypatch), []
-    for seed in range(3):
+    for seed in range(4):
         truth, start = drawn_fix(np.random.default_rng(seed))
         drive = Drive(a_world(seed), {"fixes": Fixes(0.05)}, {"fixes": truth}, True, LOOSE).run((start,))
         graph, own = drive.graph, told(drive.graph, "fixes")
@@ -312,7 +312,7 @@ class Moody(Fixes):
 def test_a_sensor_whose_code_fails_says_nothing_where_it_does_and_is_counted() -> None:
     truth, start = drawn_fix(np.random.default_rng(7))
     sensor = Moody(0.05)
-    drive = Drive(a_world(7, 24.0), {"fixes": sensor}, {"fixes": truth})
+    drive = Drive(a_world(7), {"fixes": sensor}, {"fixes": truth})
     drive.packets = [drive.packet(k, (start,)) for k in range(drive.world.count)]
     sensor.fails = True
     for packet in drive.packets:
