@@ -37,6 +37,7 @@ _MOUNTS = _ROOT  # a container's root may not
 _DROPPED_CAPABILITIES = (1, 2)  # linux/capability.h: DAC_OVERRIDE, DAC_READ_SEARCH
 _PR_CAPBSET_DROP = 24  # linux/prctl.h
 _WORLD = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=100"
+SIMULATE = "simulate corridor-loop --duration-s 1 --image-width-px 160 --out"
 _MEND_KB = 400_000
 # CPython 3.11 keeps a byte code file of which it could write a part only, and never starts again
 _ENVIRONMENT = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
@@ -89,7 +90,7 @@ def _writers(run_out: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield name, command and copies of every verb that writes."""
     yield "run", f"run {_WORLD} --out {{place}}/{run_out}", ()
     yield "demo", "demo --out {place}/demo", ()
-    yield "simulate", "simulate corridor-loop --duration-s 1 --image-width-px 160 --out {place}/world", ()
+    yield "simulate", f"{SIMULATE} {{place}}/world", ()
     yield "simulate graph", "simulate --graph grid3d --out {place}/world.g2o", ()
     yield "optimize", "optimize {place}/run", ("run",)
     yield "join", "optimize {data}/run {data}/other --out {place}/both", ()
@@ -186,7 +187,7 @@ def make_data(data: Path) -> None:
     for command in (
         f"run {_WORLD} --out {data}/run --view.no-enabled",
         f"run {_WORLD} --out {data}/other --view.no-enabled",
-        f"simulate corridor-loop --duration-s 1 --image-width-px 160 --out {data}/world",
+        f"{SIMULATE} {data}/world",
         f"simulate --graph grid3d --out {data}/graph.g2o",
     ):
         subprocess.run([sys.executable, "-m", "vislam", *command.split()], check=True, stdout=subprocess.DEVNULL)

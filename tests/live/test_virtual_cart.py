@@ -194,9 +194,7 @@ def test_only_a_calibration_makes_a_magnetometer_count() -> None:
         assert open_live(asked, Config(), sensors)[0].is_mag_calibrated is counts
 
 
-def test_without_a_camera_attitude_is_published_and_the_bias_kept_until_ctrl_c(
-    tmp_path: Path,
-) -> None:
+def test_without_a_camera_attitude_is_published_and_the_bias_kept_until_ctrl_c(tmp_path: Path) -> None:
     out, name = tmp_path / "run", f"vislam-test-blind-{os.getpid()}"
     prepare(out, overwrite=False)
     memory = tmp_path / "biases.json"

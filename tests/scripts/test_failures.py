@@ -39,21 +39,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     failures._MOUNTS = failures._MOUNTS and can_mount(folder)
     make_run(folder / "run", loops=4)
-    assert (
-        run_verb(
-            [
-                "simulate",
-                "corridor-loop",
-                "--duration-s",
-                "1",
-                "--image-width-px",
-                "160",
-                "--out",
-                str(folder / "world"),
-            ]
-        )
-        == 0
-    )
+    assert run_verb([*failures.SIMULATE.split(), str(folder / "world")]) == 0
     assert run_verb(["simulate", "--graph", "grid3d", "--out", str(folder / "graph.g2o")]) == 0
     failures.make_small_files(folder)
     return folder

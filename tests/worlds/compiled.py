@@ -10,6 +10,7 @@ import pytest
 from worlds.shared import shared
 
 GRAPH = ("simulate", "--graph", "sphere", "--poses", "60", "--out", "graph.g2o")
+OPTIMISE = ("posegraph", "graph.g2o", "--no-report", "--no-certify")
 
 
 def optimised_afresh(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -24,16 +25,6 @@ def optimised_afresh(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def optimised(folder: Path, out: Path) -> str:
     """Optimise the graph of a folder with its kernels; return what was said."""
-    command = [
-        sys.executable,
-        "-m",
-        "vislam",
-        "posegraph",
-        "graph.g2o",
-        "--no-report",
-        "--no-certify",
-        "--out",
-        str(out),
-    ]
+    command = [sys.executable, "-m", "vislam", *OPTIMISE, "--out", str(out)]
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kernels")}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True).stderr

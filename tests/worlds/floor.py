@@ -106,7 +106,8 @@ class FloorWorld:
 
     def __init__(self, rig_: Rig, contrast: float = 45.0) -> None:
         self.rig = rig_
-        self._floor, self._wall, self._rng = deepcopy(_painted(contrast))
+        self._floor, self._wall, rng = _painted(contrast)
+        self._rng = deepcopy(rng)
         u, v = np.meshgrid(np.arange(320, dtype=float), np.arange(240, dtype=float))
         self._rays = rig_.cameras[0].unproject(np.column_stack([u.ravel(), v.ravel()]))
 
