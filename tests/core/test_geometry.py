@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vislam.core import geometry as g
+from vislam.core.angles import angle_between, angles_of
 
 vectors = arrays(np.float64, 3, elements=st.floats(-1.7, 1.7, width=64))
 tangents = arrays(np.float64, 6, elements=st.floats(-1.7, 1.7, width=64))
@@ -22,8 +23,10 @@ def test_so3_exp_and_log_are_inverse(w):
 @pytest.mark.parametrize("axis", [*np.eye(3).tolist(), [0.6, -0.8, 0.0], [-0.36, 0.48, 0.8]])
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-4, 3.1415, np.pi - 1e-9, np.pi])
 def test_so3_log_is_exact_near_zero_and_pi(axis, angle):
-    R = g.so3_exp(np.array(axis) * angle)
+    R, across = g.so3_exp(np.array(axis) * angle), g.tangent_basis(np.array(axis))[:, 0]
     assert abs(np.linalg.norm(g.so3_log(R)) - angle) < 1e-7
+    assert abs(angles_of(R) - angle) < 1e-9
+    assert abs(angle_between(R @ across, across) - angle) < 1e-9
     assert np.allclose(g.so3_exp(g.so3_log(R)), R, atol=1e-9)
 
 

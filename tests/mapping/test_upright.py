@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.core.up import angle_deg
+from vislam.core.angles import angle_deg
 from vislam.mapping.upright import View, surest_up, up_of_planes
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vislam.core.angles import angle_deg
 from vislam.core.trajectory import Trajectory
-from vislam.core.up import angle_deg
 from vislam.trajectory.gravity_mean import up_of_forces
 
 UP = np.array([0.2, -0.6, 0.77])

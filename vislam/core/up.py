@@ -101,8 +101,3 @@ def turn_to_z(up: Array) -> Array:
     if sine < _SAME:
         axis, sine = np.array([1.0, 0.0, 0.0]), 1.0  # straight up already, or upside down: any level axis will do
     return np.asarray(so3_exp(axis / sine * angle))
-
-
-def angle_deg(a: Array, b: Array) -> float:
-    """Return the angle between two unit vectors [3]."""
-    return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.angles import angle_between
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert, skew, so3_exp, so3_log
 from vislam.core.messages import Array, ImageU8
@@ -117,7 +118,7 @@ def camera_tilt_rad(facts: ImuFacts, rig: Rig) -> float:
     """Return the angle between up, as the accelerometer feels it, and the top of cam0's image, through `T_BS`."""
     chosen = facts.accel_mean[facts.at_rest] if facts.at_rest.any() else facts.accel_mean
     up_cam = rig.T_body_cams[0][:3, :3].T @ chosen.mean(axis=0)
-    return float(np.arccos(np.clip(-up_cam[1] / max(float(np.linalg.norm(up_cam)), 1e-9), -1.0, 1.0)))
+    return angle_between(up_cam, np.array([0.0, -1.0, 0.0]))
 
 
 def turning_pairs(facts: ImuFacts, frame_t_ns: Stamps, count: int) -> list[tuple[int, int]]:

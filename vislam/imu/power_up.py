@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.config import PowerUpConfig
+from vislam.core.angles import angle_deg
 from vislam.core.geometry import level_rotation
 from vislam.core.messages import Array, ImuSpan
 from vislam.imu.bias_memory import BiasMemory
@@ -70,7 +71,7 @@ def power_up(
     half = len(t_s) // 2
     norm = float(np.linalg.norm(force))
     up = force / norm if norm > 0.0 else np.array([0.0, 0.0, 1.0])
-    tilt_deg = float(np.rad2deg(np.arccos(np.clip(up[2], -1.0, 1.0))))
+    tilt_deg = angle_deg(up, np.array([0.0, 0.0, 1.0]))
     checks = [
         ("the rate varies by", gyro.std(axis=0).max(), _MAX_GYRO_STD_RAD_S, "rad/s", "stand still"),
         ("the force varies by", accel.std(axis=0).max(), _MAX_ACCEL_STD_M_S2, "m/s^2", "stand still"),

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config
+from vislam.core.angles import angle_deg
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, transform
 from vislam.core.messages import Array, NavState
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
-from vislam.core.up import Up, angle_deg, parse_up
+from vislam.core.up import Up, parse_up
 from vislam.datasets.stream import FileRecording
 from vislam.frontend.planar import up_in_camera
 from vislam.mapping.mapper import Mapper

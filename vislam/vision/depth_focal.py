@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vislam.core.angles import angles_of
 from vislam.core.camera import Camera
 from vislam.core.geometry import so3_exp
 from vislam.core.jackknife import jackknife_variances
@@ -121,7 +122,7 @@ def fit_focal(
     ])  # fmt: skip
     sigma = np.sqrt(jackknife_variances(left_out))
     factor = 1.0 / (1.0 + float(shared[0]))
-    turns = [np.arccos(np.clip(0.5 * (np.trace(T[:3, :3]) - 1.0), -1.0, 1.0)) for T in T_b_as]
+    turns = angles_of(np.array(T_b_as)[:, :3, :3])
     return FocalFit(
         factor, float(sigma[0]) * factor**2, float(shared[1]), float(sigma[1]), shared[2:4], -float(shared[4]),
         len(views), sum(len(a.xyr) for a, _ in views), float(np.rad2deg(np.median(turns))),

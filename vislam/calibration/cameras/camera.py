@@ -15,6 +15,7 @@ from vislam.calibration.cameras.views import Found, choose, find_views, images_o
 from vislam.calibration.options import CameraOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.config import WebcamConfig
+from vislam.core.angles import angle_deg
 from vislam.core.messages import Array
 from vislam.datasets.calibration import camera_text
 from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text
@@ -133,8 +134,8 @@ def _focal_sigma(fit: LensFit) -> float:
 
 def _tilt_deg(T_cam_board: Array) -> float:
     """Return the angle between the board's normal and the ray to its middle."""
-    ray = T_cam_board[:3, 3] / np.linalg.norm(T_cam_board[:3, 3])
-    return float(np.rad2deg(np.arccos(np.clip(abs(T_cam_board[:3, 2] @ ray), 0.0, 1.0))))
+    tilt_deg = angle_deg(T_cam_board[:3, 2], T_cam_board[:3, 3])
+    return min(tilt_deg, 180.0 - tilt_deg)  # whichever side of the board its normal points to
 
 
 def _empty_parts(covered: Array) -> str:

@@ -14,6 +14,7 @@ from vislam.calibration.inertial.field import IronFit, fit_iron
 from vislam.calibration.inertial.tables import Table, read_field, read_inertial
 from vislam.calibration.options import MagOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
+from vislam.core.angles import angles_between, directions
 from vislam.core.errors import DataError
 from vislam.core.geometry import level_rotation
 from vislam.core.messages import Array
@@ -75,7 +76,7 @@ def solve_mag(field: Table, inertial: Table, options: MagOptions) -> MagResult:
     up = _up_at(field, inertial)
     usual = np.median(up, axis=0)
     usual /= np.linalg.norm(usual)
-    tilt_deg = float(np.rad2deg(np.quantile(np.arccos(np.clip(up @ usual, -1.0, 1.0)), 0.95)))
+    tilt_deg = float(np.rad2deg(np.quantile(angles_between(up, usual), 0.95)))
     stuck = [axis for axis, spread in zip("xyz", np.ptp(field.values, axis=0), strict=True) if spread == 0.0]
     refuse(what, [f"{', '.join(stuck)} never changes; it is stuck or saturated"] if stuck else [])
     mode = options.mode if options.mode != "auto" else ("2d" if tilt_deg < _MAX_TILT_DEG else "3d")
@@ -108,7 +109,7 @@ def sphere_seen(values: Array, centre: Array) -> tuple[Array, NDArray[np.bool_]]
     """Return directions over the sphere [M, 3], and which of them [M] a field [N, 3] about a centre came near to."""
     ways = values - centre
     ways = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
-    sphere = _sphere()
+    sphere = directions(_SPHERE_SECTORS)
     return sphere, np.asarray((sphere @ ways.T).max(axis=1) > _NEAR_COS)
 
 
@@ -203,12 +204,6 @@ def _levelled(up: Array, R_level: Array, usual: Array) -> Array:
     K -= K.transpose(0, 2, 1)
     cosine = np.clip(up @ usual, -0.99, 1.0)[:, None, None]
     return np.asarray(R_level @ (np.eye(3) + K + K @ K / (1.0 + cosine)))
-
-
-def _sphere() -> Array:
-    k = np.arange(_SPHERE_SECTORS) + 0.5
-    polar, around = np.arccos(1.0 - 2.0 * k / _SPHERE_SECTORS), np.pi * (1.0 + np.sqrt(5.0)) * k
-    return np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
 
 
 def _statements(result: MagResult) -> list[str]:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from vislam.calibration.inertial.tables import Table
+from vislam.core.angles import directions
 from vislam.core.geometry import tangent_basis
 from vislam.core.messages import Array
 from vislam.imu.gyro_turns import integrate_gyro
@@ -196,9 +197,7 @@ def _bias_of_rests(rests: list[Rest]) -> tuple[Array, Array]:
 
 def _tilt_sigma(matrix: Array, covariance: Array, gravity_m_s2: float) -> float:
     """Return the sigma of the calibrated direction of gravity, rms over all directions and both axes of tilt."""
-    k = np.arange(_SPHERE) + 0.5
-    polar, around = np.arccos(1.0 - 2.0 * k / _SPHERE), np.pi * (1.0 + np.sqrt(5.0)) * k
-    up = np.column_stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)])
+    up = directions(_SPHERE)
     raw = up * gravity_m_s2 @ np.linalg.inv(matrix).T
     total = 0.0
     for u, r in zip(up, raw, strict=True):

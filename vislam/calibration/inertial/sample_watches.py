@@ -14,6 +14,7 @@ from vislam.calibration.inertial.sample_log import SampleLog
 from vislam.calibration.options import BoardOptions, ImuOptions, MagOptions, NoiseOptions
 from vislam.calibration.outcome import Outcome
 from vislam.calibration.watching import Progress, Value
+from vislam.core.angles import angles_between
 
 _LEAST_S = 2.0  # before which nothing is judged
 _WANTED_POSES = 12
@@ -23,8 +24,8 @@ _FLAT_GAP_DEG = 40.0
 _MIN_FIELD = 100  # samples before which no centre is looked for
 
 
-class PoseWatch:
-    """Satisfies `Watch`: an IMU that is held still in twelve poses or more."""
+class _SampleWatch:
+    """Keeps the samples of a sensor."""
 
     has_images = False
 
@@ -35,6 +36,10 @@ class PoseWatch:
     def take(self, value: Value) -> None:
         """Keep a sample."""
         self._log.add(value)
+
+
+class PoseWatch(_SampleWatch):
+    """Satisfies `Watch`: an IMU that is held still in twelve poses or more."""
 
     def progress(self) -> Progress:
         """Return how many poses were held, which way was up in them, and whether it is held still now."""
@@ -68,18 +73,8 @@ class PoseWatch:
         return calibrate_imu(ImuOptions(source, out=self._folder, overwrite=True))
 
 
-class TurnWatch:
+class TurnWatch(_SampleWatch):
     """Satisfies `Watch`: a magnetometer that is turned, on the floor once around or by hand in figures of eight."""
-
-    has_images = False
-
-    def __init__(self, folder: Path, board: BoardOptions) -> None:
-        """Begin with no sample."""
-        self._folder, self._log = folder, SampleLog()
-
-    def take(self, value: Value) -> None:
-        """Keep a sample."""
-        self._log.add(value)
 
     def progress(self) -> Progress:
         """Return which directions the field came from, seen from the sensor."""
@@ -95,7 +90,7 @@ class TurnWatch:
         up = inertial.values[:, 3:] / np.maximum(np.linalg.norm(inertial.values[:, 3:], axis=1, keepdims=True), 1e-9)
         usual = np.median(up, axis=0)
         usual /= max(float(np.linalg.norm(usual)), 1e-9)
-        tilt_deg = float(np.rad2deg(np.quantile(np.arccos(np.clip(up @ usual, -1.0, 1.0)), 0.95)))
+        tilt_deg = float(np.rad2deg(np.quantile(angles_between(up, usual), 0.95)))
         gap_deg = largest_gap_deg(values, usual)
         share = float(np.mean(seen))
         is_flat = tilt_deg < _TILTED_DEG
@@ -123,18 +118,8 @@ class TurnWatch:
         return calibrate_mag(MagOptions(source, out=self._folder, overwrite=True))
 
 
-class StillWatch:
+class StillWatch(_SampleWatch):
     """Satisfies `Watch`: an IMU that stands still for an hour."""
-
-    has_images = False
-
-    def __init__(self, folder: Path, board: BoardOptions) -> None:
-        """Begin with no sample."""
-        self._folder, self._log = folder, SampleLog()
-
-    def take(self, value: Value) -> None:
-        """Keep a sample."""
-        self._log.add(value)
 
     def progress(self) -> Progress:
         """Return how long it stood still in a row."""

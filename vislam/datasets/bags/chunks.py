@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import abc
 import bz2
 import importlib
 import os
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,17 +63,35 @@ class FileBytes:
         self._file.close()
 
 
-class ChunkCache:
-    """Unpacked chunks of one file, the latest ones; several threads may ask at once."""
+class ChunkedFile(abc.ABC):
+    """A bag of chunks; the latest ones are kept unpacked, and several threads may read at once."""
 
-    def __init__(self, unpack: Callable[[int], tuple[bytes, bool]]) -> None:
-        """Take what unpacks the chunk at a place; it raises DamagedError."""
-        self._unpack = unpack
+    def __init__(self, path: Path, file: int) -> None:
+        """Open it; `file` is its number in the bag. Raises OSError."""
+        self._path, self._file = path, file
+        self._bytes = FileBytes(path)
         self._kept: OrderedDict[int, tuple[bytes, bool]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, at: int) -> tuple[bytes, bool]:
+    def close(self) -> None:
+        """Close the file."""
+        self._bytes.close()
+
+    def read(self, place: Place) -> bytes:
+        """Return the bytes of a message, which lies open in the file or in one of its chunks; raises DamagedError."""
+        if place.chunk < 0:
+            data = self._bytes.fetch(place.at, place.length)
+        else:
+            data = self._chunk_at(place.chunk)[0][place.at : place.at + place.length]
+        if len(data) != place.length:
+            raise DamagedError("message cut short")
+        return data
+
+    @abc.abstractmethod
+    def _unpack(self, at: int) -> tuple[bytes, bool]:
         """Return the bytes in the chunk at a place, and whether they are all there; raises DamagedError."""
+
+    def _chunk_at(self, at: int) -> tuple[bytes, bool]:
         with self._lock:
             if at in self._kept:
                 self._kept.move_to_end(at)
@@ -84,15 +102,12 @@ class ChunkCache:
                 self._kept.popitem(last=False)
             return data
 
-    def message(self, file: FileBytes, place: Place) -> bytes:
-        """Return the bytes of a message, which lies open in the file or in one of its chunks; raises DamagedError."""
-        if place.chunk < 0:
-            data = file.fetch(place.at, place.length)
-        else:
-            data = self.get(place.chunk)[0][place.at : place.at + place.length]
-        if len(data) != place.length:
-            raise DamagedError("message cut short")
-        return data
+    def _unpacked(self, at: int, length: int, method: str, declared: int) -> tuple[bytes, bool]:
+        if length > MOST_CHUNK_BYTES:
+            raise DamagedError(f"packed chunk of {length} bytes")
+        data = self._bytes.fetch(at, length)
+        out, whole = unpacked(data, method, declared)
+        return out, whole and len(data) == length
 
 
 def unpacked(data: bytes, method: str, declared: int) -> tuple[bytes, bool]:

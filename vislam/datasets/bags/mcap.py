@@ -8,12 +8,11 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 from vislam.core.errors import DataError
 from vislam.datasets.bags import foxglove
-from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, Bytes, ChunkCache, FileBytes, unpacked
+from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, Bytes, ChunkedFile, FileBytes
 from vislam.datasets.bags.stored import (
     HEAD_BYTES,
     MOST_MESSAGE_BYTES,
@@ -63,23 +62,8 @@ class _Chunk(NamedTuple):
     unpacked_length: int
 
 
-class Mcap:
+class Mcap(ChunkedFile):
     """One MCAP file."""
-
-    def __init__(self, path: Path, file: int) -> None:
-        """Open it. Raises OSError."""
-        self._path = path
-        self._file = file
-        self._bytes = FileBytes(path)
-        self._chunks = ChunkCache(self._unpack)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._bytes.close()
-
-    def read(self, place: Place) -> bytes:
-        """Return the bytes of a message; raises DamagedError."""
-        return self._chunks.message(self._bytes, place)
 
     def scan(self, problems: Problems) -> Iterator[Found]:
         """Yield the messages in the order in which they were stored; raises DataError when it is no MCAP file."""
@@ -112,18 +96,14 @@ class Mcap:
             end = min(chunk.at + chunk.length, self._bytes.size)
             yield from _walk(self._bytes, chunk.at, end, (self._file, -1), known)
             return
-        data, whole = self._chunks.get(at)
+        data, whole = self._chunk_at(at)
         yield from _walk(Bytes(data), 0, len(data), (self._file, at), known)
         if not whole:
             problems.count(f"{self._path.name}: chunk that cannot be unpacked to its end", f"byte {at}")
 
     def _unpack(self, at: int) -> tuple[bytes, bool]:
         chunk = _chunk_head(self._bytes.fetch(at, _MOST_HEAD_BYTES), at)
-        if chunk.length > MOST_CHUNK_BYTES:
-            raise DamagedError(f"packed chunk of {chunk.length} bytes")
-        data = self._bytes.fetch(chunk.at, chunk.length)
-        out, whole = unpacked(data, chunk.method, chunk.unpacked_length)
-        return out, whole and len(data) == chunk.length
+        return self._unpacked(chunk.at, chunk.length, chunk.method, chunk.unpacked_length)
 
     def _next_chunk(self, at: int) -> int:
         """Return where the next chunk begins, by the index if there is one; the file's end when there is none.

@@ -9,10 +9,9 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 
 from vislam.core.errors import DataError
-from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, Bytes, ChunkCache, FileBytes, unpacked
+from vislam.datasets.bags.chunks import Bytes, ChunkedFile, FileBytes
 from vislam.datasets.bags.stored import (
     HEAD_BYTES,
     MOST_MESSAGE_BYTES,
@@ -37,23 +36,8 @@ _TIME = struct.Struct("<II")
 Fields = dict[bytes, bytes]
 
 
-class Rosbag1:
+class Rosbag1(ChunkedFile):
     """One file of rosbag 1."""
-
-    def __init__(self, path: Path, file: int) -> None:
-        """Open it. Raises OSError."""
-        self._path = path
-        self._file = file
-        self._bytes = FileBytes(path)
-        self._chunks = ChunkCache(self._unpack)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._bytes.close()
-
-    def read(self, place: Place) -> bytes:
-        """Return the bytes of a message; raises DamagedError."""
-        return self._chunks.message(self._bytes, place)
 
     def scan(self, problems: Problems) -> Iterator[Found]:
         """Yield the messages in the order in which they were stored; raises DataError when it is no rosbag."""
@@ -84,7 +68,7 @@ class Rosbag1:
             end = min(data_at + length, self._bytes.size)
             yield from _walk(self._bytes, data_at, end, (self._file, -1), topics)
             return
-        data, whole = self._chunks.get(at)
+        data, whole = self._chunk_at(at)
         yield from _walk(Bytes(data), 0, len(data), (self._file, at), topics)
         if not whole:
             problems.count(f"{self._path.name}: chunk that cannot be unpacked to its end", f"byte {at}")
@@ -92,12 +76,8 @@ class Rosbag1:
     def _unpack(self, at: int) -> tuple[bytes, bool]:
         reader = Bytes(self._bytes.fetch(at, _MOST_HEADER_BYTES))
         fields, data_at, length = _record(reader, 0)
-        if length > MOST_CHUNK_BYTES:
-            raise DamagedError(f"packed chunk of {length} bytes")
         method = fields.get(b"compression", b"").decode("ascii", "replace")
-        data = self._bytes.fetch(at + data_at, length)
-        out, whole = unpacked(data, method, _number(fields, b"size"))
-        return out, whole and len(data) == length
+        return self._unpacked(at + data_at, length, method, _number(fields, b"size"))
 
     def _next_chunk(self, at: int) -> int:
         """Return where the next chunk begins; the file's end when there is none."""

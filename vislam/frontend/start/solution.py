@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.angles import angle_between
 from vislam.core.messages import Array
 from vislam.frontend.start.inertial_alignment import Alignment
 from vislam.window.bundle import BundleSolution
@@ -55,7 +56,7 @@ class Solution:
         if t_ns[i] != at[k]:  # not a node of both
             return ""
         up_now, up_then = self.T_world_body[i, 2, :3], before.T_world_body[k, 2, :3]
-        tilt = float(np.arccos(np.clip(up_now @ up_then, -1.0, 1.0)))
+        tilt = angle_between(up_now, up_then)
         limit = sigmas * float(np.hypot(self.tilt_sigma_rad, before.tilt_sigma_rad))
         if tilt > limit:
             return f"the vertical differs by {np.rad2deg(tilt):.1f} deg, {np.rad2deg(limit):.1f} are chance"

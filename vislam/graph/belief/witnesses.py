@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import GraphConfig
+from vislam.core.angles import angles_of
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, invert_many, so3_log
 from vislam.factors.loop import LoopModel
@@ -107,8 +108,7 @@ def confirming(loops: Sequence[LoopModel], chain: Chain, evidence_min: float, lo
             for i, sums in enumerate((chain.rad2, chain.m2))
         )
         m2 = m2 + rad2 * lever**2 / 3.0
-        cosine = np.clip((np.trace(cycle[:, :3, :3], axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
-        d2 = np.arccos(cosine) ** 2 / rad2 + np.sum(cycle[:, :3, 3] ** 2, axis=1) / m2
+        d2 = angles_of(cycle[:, :3, :3]) ** 2 / rad2 + np.sum(cycle[:, :3, 3] ** 2, axis=1) / m2
         evidence = log_volume - 1.5 * (np.log(rad2) + np.log(m2)) - 3.0 * np.log(2.0 * np.pi) - 3.0
         agree[n] = (d2 < limit) & (evidence > evidence_min)
         agree[n, n] = False

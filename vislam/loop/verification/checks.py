@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vislam.core.angles import angle_between
 from vislam.core.messages import Array, LoopDecision
 from vislam.loop.verification.verifier import Verification
 
@@ -24,7 +25,7 @@ def tilt_error_rad(T_from_to: Array, T_map_from: Array, T_map_to: Array) -> floa
     Down is known in both keyframes of a gravity-aligned map; the relative rotation must turn one into the other.
     """
     measured = T_from_to[:3, :3] @ T_map_to[2, :3]
-    return float(np.arccos(np.clip(measured @ T_map_from[2, :3], -1.0, 1.0)))
+    return angle_between(measured, T_map_from[2, :3])
 
 
 def judge(found: Verification, tilt_rad: float | None) -> tuple[LoopDecision, str]:

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.angles import angle_deg
 from vislam.core.geometry import tangent_basis
 from vislam.core.messages import Array
-from vislam.core.up import Up, angle_deg
+from vislam.core.up import Up
 from vislam.mapping.upright.normals import REACHES, View
 
 _CAP_DEG = 5.0  # surfaces within it belong to a direction; noise of normals is 2 to 3 degrees

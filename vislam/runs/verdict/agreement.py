@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vislam.core.angles import angle_deg
 from vislam.core.geometry import so3_log
 from vislam.core.messages import Array
 from vislam.imu import Preintegrated
@@ -112,7 +113,7 @@ def force_agreement(
     scale_sigma = np.hypot(np.sqrt(covariance[0, 0]), _dilution(A[:, :, 0], b - A[:, :, 1:] @ x[1:]))
     norm = float(np.linalg.norm(x[1:4]))
     along = x[1:4] / max(norm, 1e-9)
-    tilt = float(np.rad2deg(np.arccos(np.clip(-along[2], -1.0, 1.0))))
+    tilt = angle_deg(along, np.array([0.0, 0.0, -1.0]))
     sigma = float(np.sqrt(along @ covariance[1:4, 1:4] @ along))
     return ForceAgreement(len(rows), float(x[0]), float(scale_sigma), norm, sigma, tilt)
 

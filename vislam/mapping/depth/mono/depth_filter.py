@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import MonoDepthConfig
+from vislam.core.angles import angles_of
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rigid, invert
 from vislam.core.messages import Array, ImageF32, ImageU8
@@ -85,7 +86,7 @@ class DepthFilter:
         _check_rigid(T)
         T_cur_ref = invert(np.ascontiguousarray(T))
         R, t = T_cur_ref[:3, :3], T_cur_ref[:3, 3]
-        turn_deg = np.rad2deg(np.arccos(np.clip(0.5 * (np.trace(R) - 1.0), -1.0, 1.0)))
+        turn_deg = np.rad2deg(angles_of(R))
         current = image.astype(np.float32)
         if turn_deg > self._config.derotate_deg:
             current = self._derotated(current, R)
