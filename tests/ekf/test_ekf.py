@@ -511,7 +511,7 @@ def test_bad_samples_change_nothing_but_counters(scene: Scene) -> None:
             dirty.predict(ImuSample(s.t_ns + 1, np.array([np.nan, 0, 0]), np.zeros(3)))
     assert_same(clean.state(), dirty.state())
     counters = dirty.counters
-    assert (counters["imu_duplicate"], counters["imu_backward"], counters["imu_nan"]) == (1, 1, 1)
+    assert (counters["imu_duplicate"], counters["imu_late"], counters["imu_unusable"]) == (1, 1, 1)
 
 
 @pytest.mark.parametrize(

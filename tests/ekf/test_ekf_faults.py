@@ -110,22 +110,19 @@ def test_clocks_that_leap() -> None:
     refused(bench, "too_early", bench.ekf.update_vo(replace(bench.next, t_ns=now + 3600 * NS)), before, 1)
     refused(bench, "too_early", bench.ekf.add_keyframe(9, 1 << 62), before, 2)
     bench.ekf.predict(replace(sample(bench.way, bench.k), t_ns=now - NS))
-    refused(bench, "imu_backward", None, before)
+    refused(bench, "imu_late", None, before)
     assert bench.ekf.state_at(now + NS) is None
     assert bench.ekf.pose_at(now - 100 * NS) is None
     bench.assert_well()
 
 
-@pytest.mark.parametrize(
-    ("value", "counter"),
-    [(np.nan, "imu_nan"), (np.inf, "imu_impossible"), (-np.inf, "imu_impossible"), (1e200, "imu_impossible")],
-)
-def test_samples_that_no_sensor_gives(value: float, counter: str) -> None:
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+def test_samples_that_no_sensor_gives(value: float) -> None:
     bench = Bench()
     before, good = bench.ekf.state(), sample(bench.way, bench.k + 1)
     bench.ekf.predict(replace(good, gyro_rad_s=np.array([0.0, value, 0.0]), t_ns=good.t_ns - 1))
     bench.ekf.predict(replace(good, accel_m_s2=np.array([value, 0.0, 9.81]), t_ns=good.t_ns - 1))
-    refused(bench, counter, None, before, 2)
+    refused(bench, "imu_unusable", None, before, 2)
     bench.assert_well()
 
 

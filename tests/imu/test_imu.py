@@ -62,7 +62,7 @@ def test_bad_samples_are_refused_and_counted() -> None:
     assert not buffer.add(ImuSample(T0_NS + NS, np.array([0.0, np.nan, 0.0]), np.zeros(3)))
     assert not buffer.add(ImuSample(T0_NS + NS, np.zeros(3), np.array([0.0, np.inf, 0.0])))
     assert buffer.newest_t_ns == T0_NS + 100_000_000
-    assert buffer.counters == {"samples": 11, "impossible": 1, "nan": 1, "backward": 1, "duplicate": 1, "gaps": 0}
+    assert buffer.counters == {"samples": 11, "unusable": 2, "late": 1, "duplicate": 1, "stuck": 0, "gaps": 0}
 
 
 def test_history_is_bounded() -> None:

@@ -164,8 +164,8 @@ def test_duplicate_backward_and_nan_samples_are_counted_not_used(small_room, tmp
     metrics = run(Edited(small_room, disturbed), tmp_path / "run", map__enabled=False)
     imu = metrics["counters"]["imu"]
     assert imu["duplicate"] > 10
-    assert imu["backward"] > 10
-    assert imu["nan"] > 10
+    assert imu["late"] > 10
+    assert imu["unusable"] > 10
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
 
 

@@ -48,7 +48,7 @@ class Timeline(Generic[S, M]):
         self._checkpoint_ns = round(_CHECKPOINT_S * _NS)
         self._history_ns = round(history_s * _NS)
         self._max_gap_ns = round(max_gap_s * _NS)
-        self._series = ImuSeries(extra=10)  # beside each sample, x[:10] as of the last run through it
+        self._series = ImuSeries(10, max_gap_s)  # beside each sample, x[:10] as of the last run through it
         self._history: History[S, M] | None = None
         self._t_ns = 0
         self._applied = 0
@@ -64,7 +64,7 @@ class Timeline(Generic[S, M]):
     @property
     def counters(self) -> dict[str, int]:
         """What came in and what became of it."""
-        return {**self._counts, **{f"imu_{reason}": n for reason, n in self._series.refused.items()}}
+        return {**self._counts, **{f"imu_{reason}": n for reason, n in self._series.judge.refused.items()}}
 
     @property
     def nis_statistics(self) -> Statistics:
@@ -85,7 +85,7 @@ class Timeline(Generic[S, M]):
     def predict(self, sample: ImuSample) -> None:
         """Take a sample and bring the state to its time.
 
-        Samples that are not finite, beyond any sensor, duplicate or backward are counted and change nothing.
+        Samples that are no measurement of a new time, see `StreamJudge`, are counted and change nothing.
         """
         before = self._series.newest_t_ns
         if not self._series.append(sample):

@@ -10,10 +10,12 @@ import numpy as np
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImageU8, Observations
+from vislam.core.streams import Happening, StreamJudge
 
 _DESCRIPTOR_BYTES = 32
 _EVERY_PX = 8  # the image is compared with the one before at one pixel in so many, each way
-_MEDIAN_OF = 31  # intervals, that tell the usual one
+_HOLE_S = 0.25  # without a frame, at least
+_DARK = 3.0  # mean grey, and as much of its scatter, below which an image shows nothing
 
 
 class Intake:
@@ -82,35 +84,42 @@ class Intake:
 
 
 class CameraFeed:
-    """Owns a small copy of the last image and the last intervals.
+    """Owns a small copy of the last image.
 
     Attributes:
         frames: so far.
         missing: frames that an even rate would have brought.
         repeated: images equal to the one before to the last bit while the body moved, which noise makes impossible.
+        judge: of their times, and of what happened to images.
+        first_t_ns: of the first one; None before it.
     """
 
     def __init__(self) -> None:
         """Start empty."""
         self.frames = self.missing = self.repeated = 0
+        self.judge = StreamJudge("cam0", hole_s=_HOLE_S)
+        self.first_t_ns: int | None = None
         self._last: ImageU8 | None = None
         self._last_t_ns: int | None = None
-        self._intervals_ns: list[int] = []
         self._is_same = False
 
     def add(self, frame: Frame) -> None:
         """Take a frame as the camera gave it; `moved` has to follow."""
         self.frames += 1
-        if self._last_t_ns is not None:
-            step_ns = frame.t_ns - self._last_t_ns
-            self._intervals_ns = [*self._intervals_ns[1 - _MEDIAN_OF :], step_ns]
-            usual_ns = float(np.median(self._intervals_ns))
-            self.missing += max(round(step_ns / usual_ns) - 1, 0) if usual_ns > 0.0 else 0
+        self.first_t_ns = frame.t_ns if self.first_t_ns is None else self.first_t_ns
+        usual_ns = self.judge.usual_ns
+        self.judge.takes(frame.t_ns)
+        if self._last_t_ns is not None and usual_ns:
+            self.missing += max(round((frame.t_ns - self._last_t_ns) / usual_ns) - 1, 0)
         self._last_t_ns = frame.t_ns
         small = frame.images[0][::_EVERY_PX, ::_EVERY_PX].copy() if frame.images else None
         self._is_same = small is not None and self._last is not None and np.array_equal(small, self._last)
+        if small is not None and small.mean() < _DARK and small.std() < _DARK:
+            self.judge.note(Happening.DARK, frame.t_ns, frame.t_ns)
         self._last = small
 
     def moved(self, at_rest: bool) -> None:
         """Say whether the body rested over the newest frame."""
-        self.repeated += self._is_same and not at_rest
+        if self._is_same and not at_rest and self._last_t_ns is not None:
+            self.repeated += 1
+            self.judge.note(Happening.REPEATED, self._last_t_ns, self._last_t_ns)

@@ -9,6 +9,7 @@ import numpy as np
 from vislam.config import ImuConfig, MachineConfig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import ImuSample, ImuSpan
+from vislam.core.streams import StreamEvent
 from vislam.imu.noise_floor import NoiseFloor
 from vislam.imu.series import ImuSeries
 
@@ -19,8 +20,7 @@ class ImuBuffer:
     """Takes samples in time order and cuts spans with interpolated ends; bounded by `config.buffer_s`.
 
     Attributes:
-        counters: "samples" taken; "impossible", "nan", "backward", "duplicate" refused; "gaps" longer than
-            `machine.max_gap_s`.
+        counters: "samples" taken; those refused, by what happened; "gaps" longer than `machine.max_gap_s`.
         noise_floor: what the samples show of their noise; None without a model to compare with.
         outages: spans that `unbroken` could not give.
     """
@@ -29,7 +29,7 @@ class ImuBuffer:
         """Start empty; with a noise model the spans have what the samples show against it."""
         self.noise_floor = None if noise is None else NoiseFloor(noise)
         self.outages = 0
-        self._series = ImuSeries()
+        self._series = ImuSeries(max_gap_s=machine.max_gap_s)
         self._buffer_ns = round(config.buffer_s * _NS)
         self._max_gap_ns = round(machine.max_gap_s * _NS)
         self._samples = 0
@@ -49,10 +49,15 @@ class ImuBuffer:
     @property
     def counters(self) -> dict[str, int]:
         """What was taken, refused and missing so far."""
-        return {"samples": self._samples, **self._series.refused, "gaps": self._gaps}
+        return {"samples": self._samples, **self._series.judge.refused, "gaps": self._gaps}
+
+    @property
+    def events(self) -> list[StreamEvent]:
+        """What happened in the stream so far."""
+        return self._series.judge.events
 
     def add(self, sample: ImuSample) -> bool:
-        """Take a sample; False, and a counter, if no sensor gives it or it is not newer than the last."""
+        """Take a sample; False, and a counter, if it is no measurement or not newer than the last."""
         newest = self._series.newest_t_ns
         if not self._series.append(sample):
             return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -11,27 +10,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.messages import Array, ImuSample, ImuSpan, NoiseScale
+from vislam.core.streams import StreamJudge
 
 _FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
-_MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 1e3, 1e4  # beyond every sensor: such numbers come from a broken transfer
+_MOST = (*3 * (1e3,), *3 * (1e4,))  # rad/s, m/s^2; beyond every sensor: such numbers come from a broken transfer
 
 
 class ImuSeries:
     """A growing, sliding window of samples; rows stay contiguous so that compiled code can run over them.
 
     Attributes:
-        refused: samples not taken, by reason: "impossible", "nan", "backward", "duplicate".
+        judge: which samples are taken, and what happened in the stream.
     """
 
-    def __init__(self, extra: int = 0) -> None:
-        """Start empty; `extra` is the number of further columns that a user keeps beside each sample, NaN at first."""
+    def __init__(self, extra: int = 0, max_gap_s: float = 0.0) -> None:
+        """Start empty.
+
+        Args:
+            extra: the number of further columns that a user keeps beside each sample, NaN at first.
+            max_gap_s: shorter ones are no holes.
+        """
         self._t_ns: NDArray[np.int64] = np.empty(_FIRST_CAPACITY, dtype=np.int64)
         self._values: Array = np.empty((_FIRST_CAPACITY, 6))
         self._extra: Array = np.empty((_FIRST_CAPACITY, extra))
         self._begin = 0
         self._end = 0
         self._newest_t_ns = -(1 << 62)
-        self.refused = {"impossible": 0, "nan": 0, "backward": 0, "duplicate": 0}
+        self.judge = StreamJudge("imu0", _MOST, max_gap_s)
 
     def __len__(self) -> int:
         """Return the number of samples held."""
@@ -58,23 +63,13 @@ class ImuSeries:
         return self._newest_t_ns if self._end > self._begin else None
 
     def append(self, sample: ImuSample) -> bool:
-        """Take a sample that a sensor can give and that is newer than the last; else count why not, return False."""
-        t_ns = sample.t_ns
-        gyro, accel = sample.gyro_rad_s.tolist(), sample.accel_m_s2.tolist()
-        if max(map(abs, gyro)) > _MAX_RATE_RAD_S or max(map(abs, accel)) > _MAX_FORCE_M_S2:
-            self.refused["impossible"] += 1
-            return False
-        if not math.isfinite(sum(gyro) + sum(accel)):
-            self.refused["nan"] += 1
-            return False
-        if t_ns <= self._newest_t_ns:
-            self.refused["duplicate" if t_ns == self._newest_t_ns else "backward"] += 1
+        """Take a sample if the judge does; return whether."""
+        t_ns, six = sample.t_ns, [*sample.gyro_rad_s.tolist(), *sample.accel_m_s2.tolist()]
+        if not self.judge.takes(t_ns, six):
             return False
         if self._end == len(self._t_ns):
             self._make_room()
-        row = self._values[self._end]
-        row[:3] = gyro
-        row[3:] = accel
+        self._values[self._end] = six
         self._extra[self._end] = np.nan
         self._t_ns[self._end] = t_ns
         self._newest_t_ns = t_ns

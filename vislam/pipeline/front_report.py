@@ -13,6 +13,7 @@ from vislam.core.geometry import so3_exp
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import StartFacts
 from vislam.core.messages import Array, ImuSpan, NavState, Tracking
+from vislam.core.streams import StreamEvent
 from vislam.frontend import TrackResult, knows_scale
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.intake import CameraFeed
@@ -51,6 +52,8 @@ class FrontReport:
     told_noise: ImuNoise | None = None  # of the IMU
     track_noise: dict[str, Any] = field(default_factory=dict)  # of pixels: what tracks showed, and what was used for it
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # further ones, see `ReadingIntake.report`
+    first_t_ns: int = 0  # of the first frame
+    events: tuple[StreamEvent, ...] = ()  # what happened in the streams of camera and IMU
 
     @property
     def alignment(self) -> Alignment:
@@ -165,11 +168,13 @@ class RunWatch:
 def report_of(front: Front) -> FrontReport:
     """Return what there is to say of a run so far."""
     imu, begun = front.inertial, front.begun
+    events = [*front.watch.feed.judge.events, *([] if imu is None else imu.buffer.events)]
     report = FrontReport(
         front.frontend.mode, None, front.start, begun.refusal, _counters(front), {}, [], {},
         front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, told_noise=front.noise,
         track_noise=front.watch.tracks.summary(_given_px(front)),
         sensors={} if front.readings is None else front.readings.report(),
+        first_t_ns=front.watch.feed.first_t_ns or 0, events=tuple(sorted(events, key=lambda event: event.from_ns)),
     )  # fmt: skip
     if imu is None:
         return report

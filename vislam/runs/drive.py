@@ -353,6 +353,7 @@ class Run:
             "nis": front.nis,
             "sensors": sensors_entry(front.sensors, front.counters, None if back is None else back.graph),
             "problems": self._input.problems,
+            "events": [event.entry(front.first_t_ns) for event in front.events],
             "loops": loops,
             "graph_revisions": self.log.revisions,
             "coverage_frames": evidence.coverage,

@@ -14,6 +14,7 @@ from vislam.config import Config, MachineConfig
 from vislam.core.errors import VislamError
 from vislam.core.memory import EdgeReport
 from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
+from vislam.core.streams import Happening, StreamEvent
 from vislam.imu import Preintegrated, preintegrate
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
@@ -66,6 +67,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         uniform_s=report.uniform_s,
         gravity_m_s2=machine.gravity_m_s2,
         max_gap_s=machine.max_gap_s,
+        events=tuple(event.words(report.first_t_ns) for event in report.events if _matters(event, machine.max_gap_s)),
         **_calibration(report.calibration),
     )
     condition, noise, given = report.condition, report.noise_ratios, report.told_noise
@@ -81,6 +83,13 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         saturated=condition.saturated_axes,
         force_m_s2=condition.force_m_s2 if np.isfinite(condition.force_m_s2) else None,
     )
+
+
+def _matters(event: StreamEvent, max_gap_s: float) -> bool:
+    """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
+    lasted_s = (event.to_ns - event.from_ns) * 1e-9
+    is_gone = event.happening in (Happening.STUCK, Happening.UNUSABLE) and lasted_s > max_gap_s
+    return is_gone or event.happening is Happening.STEP_BACK
 
 
 def _calibration(learned: dict[str, float]) -> dict[str, Any]:

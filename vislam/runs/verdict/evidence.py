@@ -43,6 +43,7 @@ class Apart:
 class Evidence:
     """The evidence of a run so far. Defaults are those of a run about which nothing is known and nothing wrong."""
 
+    events: tuple[str, ...] = ()  # in streams of sensors, that leave less to go on
     # vision
     mode: str = ""
     frames: int = 0

@@ -113,6 +113,11 @@ def _lost(e: Evidence, _: VerdictConfig) -> Iterator[str]:
         yield f"only {e.coverage:.0%} of the frames have a pose ({e.start_reason or 'vision was lost'})"
 
 
+def _streams(e: Evidence, _: VerdictConfig) -> Iterator[str]:
+    """Name what happened to sensors: much of what else is wrong comes of that."""
+    yield from (f"{event}: look at the sensor's cable, driver and clock" for event in e.events)
+
+
 def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     if e.frames < _MIN_FRAMES:
         return
@@ -245,7 +250,7 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
 
 
 _TESTS: tuple[Callable[[Evidence, VerdictConfig], Iterator[str]], ...] = (
-    _start, _vision, _calibration, _inertial, _filter, _graph,
+    _streams, _start, _vision, _calibration, _inertial, _filter, _graph,
 )  # fmt: skip
 
 

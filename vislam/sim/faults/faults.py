@@ -324,6 +324,20 @@ def _missing(six: Array, since_s: float, _: np.random.Generator) -> Array | None
     return None if in_window(since_s, _BEGIN_S, 1.5) else six
 
 
+def _stuck(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterator[Event]:
+    """Repeat one sample from `_BEGIN_S` on, with stamps that go on."""
+    first_ns: int | None = None
+    kept: ImuSample | None = None
+    for value in events:
+        if isinstance(value, Frame) and first_ns is None:
+            first_ns = value.t_ns
+        if isinstance(value, ImuSample) and first_ns is not None and value.t_ns - first_ns > _BEGIN_S * _NS:
+            kept = value if kept is None else kept
+            yield replace(kept, t_ns=value.t_ns)
+        else:
+            yield value
+
+
 # -- what is stated of the cameras -------------------------------------------------------------------------------------
 
 
@@ -367,5 +381,6 @@ FAULTS: Mapping[str, Fault] = {
     "gyro flipped": Fault("the gyro's z axis has the wrong sign", _needs("imu"), _inertial(_gyro_flipped)),
     "clipped": Fault("the gyro saturates at 0.5 rad/s", _needs("imu"), _inertial(_clipped)),
     "stretched": Fault("the accelerometer reads 5 % too much", _needs("imu"), _inertial(_stretched)),
+    "stuck": Fault("one inertial sample again and again", _needs("imu"), _stuck),
     "missing": Fault("no inertial sample for 1.5 s", _needs("imu"), _inertial(_missing)),
 }  # fmt: skip
