@@ -103,6 +103,64 @@ def test_loops_that_ask_for_places_far_apart_wait_without_a_marginal(
     assert asked == []
 
 
+def tied(graph: PoseGraph, world: World, edges: dict[int, list[LoopEdge]], sigma_m: float) -> GraphUpdate:
+    """Run without inertial data, the submap tied to what was before by habit, 10 cm off."""
+    habit = invert(world.truth[LOST - 1]) @ world.truth[LOST] @ transform(np.eye(3), np.array([0.1, 0.0, 0.0]))
+    covariance = np.diag(np.repeat([0.2, sigma_m], 3) ** 2)
+    for k in range(COUNT):
+        packet = replace(world.packet(k, lost=k == LOST, imu=False), begins_submap=k == LOST)
+        if k == LOST:
+            packet = replace(packet, vo=replace(packet.vo, T_keyframe_body=habit, covariance=covariance))
+        T_odom_body = world.truth[k] if k < LOST else world.truth[LOST - 1] @ habit @ invert(world.truth[LOST]) @ (
+            world.truth[k]
+        )  # fmt: skip
+        update = graph.add(packet, edges.get(k, []), T_odom_body)
+    return update
+
+
+def panels_further(world: World, frames: tuple[int, ...], step_m: float, first_id: int = 0) -> list[LoopEdge]:
+    """Return loops to what was just before the loss, all by the same step too far."""
+    off = transform(np.eye(3), np.array([step_m, 0.0, 0.0]))
+    true = [world.loop(first_id + n, 145, k) for n, k in enumerate(frames)]
+    return [replace(edge, T_from_to=off @ edge.T_from_to) for edge in true]
+
+
+@pytest.mark.parametrize("sigma_m", [0.1, 0.15])
+def test_loops_one_panel_further_than_habit_allows_join_nothing_and_true_ones_do(world: World, sigma_m: float) -> None:
+    frames = (152, 154, 156, 158, 160)
+    wrong = panels_further(world, frames, 2.0)
+    update = tied(loose(world, imu=False), world, {edge.to_id: [edge] for edge in wrong}, sigma_m)
+    assert update.submaps.groups == (0, 1)
+    right = panels_further(world, frames[:3], 0.0, 10)
+    both = {k: [edge for edge in (*wrong, *right) if edge.to_id == k] for k in frames}
+    graph = loose(world, imu=False)
+    assert tied(graph, world, both, sigma_m).submaps.groups == (0, 0)
+    off = invert(graph.poses()[140]) @ graph.poses()[170]
+    np.testing.assert_allclose(off, invert(world.truth[140]) @ world.truth[170], atol=0.06)
+
+
+def test_two_places_that_habit_does_not_tell_apart_are_rivals_and_the_submap_stays_apart(world: World) -> None:
+    frames = (152, 154, 156, 158, 160, 162)
+    edges = {
+        k: [edge for n, step_m in enumerate((0.0, 1.0)) for edge in panels_further(world, (k,), step_m, 10 * k + n)]
+        for k in frames
+    }
+    assert tied(loose(world, imu=False), world, edges, 0.5).submaps.groups == (0, 1)
+    assert tied(loose(world, imu=False), world, {k: edges[k][:1] for k in frames}, 0.5).submaps.groups == (0, 0)
+
+
+def test_a_submap_that_nothing_joins_stays_where_habit_has_it(world: World) -> None:
+    graph = loose(world, imu=False)
+    tied(graph, world, {}, 0.3)
+    graph.finish()
+    off = (
+        invert(invert(world.truth[LOST - 1]) @ world.truth[LOST])
+        @ invert(graph.poses()[LOST - 1])
+        @ graph.poses()[LOST]
+    )
+    assert np.linalg.norm(off[:3, 3]) == pytest.approx(0.1, abs=0.01)
+
+
 def test_a_lie_among_true_loops_is_left_out(world: World) -> None:
     graph = loose(world, imu=False)
     edges = loops(world, 158, 160, 162, 164)

@@ -184,6 +184,11 @@ class KeyframePacket:
     filter_state: NavState | None = None  # where a further sensor sees motion: a window that contradicts it is wrong
     state_at_sight: NavState | None = None  # the filter's, at the first keyframe with sight after some without
 
+    @property
+    def is_tied(self) -> bool:
+        """Whether it begins a submap and habit says where from: `vo` has the motion, though vision lost it."""
+        return self.begins_submap and self.vo.tracking is Tracking.LOST and self.vo.T_keyframe_body is not None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopCandidate:
@@ -282,10 +287,12 @@ class Submaps:
 
     first_ids: tuple[int, ...] = (0,)  # the keyframe with which each submap begins
     groups: tuple[int, ...] = (0,)  # of each submap: the oldest submap that it is joined with, itself when with none
+    tied_ids: tuple[int, ...] = ()  # those of `first_ids` that habit ties to the keyframe before
 
-    def begun(self, keyframe_id: int) -> Submaps:
-        """Return these submaps and a new one that begins with a keyframe."""
-        return Submaps((*self.first_ids, keyframe_id), (*self.groups, len(self.groups)))
+    def begun(self, keyframe_id: int, is_tied: bool = False) -> Submaps:
+        """Return these submaps and a new one that begins with a keyframe; `is_tied` as in KeyframePacket."""
+        ties = (*self.tied_ids, keyframe_id) if is_tied else self.tied_ids
+        return Submaps((*self.first_ids, keyframe_id), (*self.groups, len(self.groups)), ties)
 
     def joined_by(self, pairs: Iterable[tuple[int, int]]) -> Submaps:
         """Return these submaps joined by exactly these pairs of keyframes."""
@@ -307,6 +314,11 @@ class Submaps:
     def are_joined(self, one: int, other: int) -> bool:
         """Return whether two keyframes are in one submap, or in submaps that are joined."""
         return self.group(one) == self.group(other)
+
+    def are_tied(self, one: int, other: int) -> bool:
+        """Return whether odometry and habit lead from one keyframe to another."""
+        first, last = sorted((self.of(one), self.of(other)))
+        return set(self.first_ids[first + 1 : last + 1]) <= set(self.tied_ids)
 
     def groups_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the groups [N] of keyframes [N]."""

@@ -51,6 +51,7 @@ class KeyframeRecord:
     imu: ImuSpan | None
     rest_from: int | None  # the keyframe since which the body has not moved; None: it may have
     begins_submap: bool = False  # nothing was measured; then the motion above is a guess, with sigmas that say so
+    is_tied: bool = False  # as in KeyframePacket; then the sigmas are known
     readings: tuple[PlacedReading, ...] = ()  # of other sensors; none where a submap begins
     own_starts: tuple[OwnStart, ...] = ()
 
@@ -110,7 +111,8 @@ def keyframe_records(packets: Sequence[KeyframePacket], previous: KeyframeRecord
     has_scale = np.array([out[n].has_scale for n in odd], dtype=np.bool_)
     useful = _are_useful(T, covariances, has_scale, np.array(steps_s)[odd])
     for n, motion, covariance, is_useful in zip(odd, T, covariances, useful.tolist(), strict=True):
-        measured = (motion, covariance) if is_useful else (None, None)
+        is_kept = out[n].is_tied or is_useful
+        measured = (motion, covariance) if is_kept else (None, None)
         out[n] = replace(out[n], T_previous_body=measured[0], covariance=measured[1])
     return out
 
@@ -126,7 +128,11 @@ def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> Keyfram
     if previous is None:
         return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, None, own_starts=starts)
     if packet.begins_submap:  # of another recording perhaps, whose clock began anew
-        return KeyframeRecord(keyframe.id, keyframe.t_ns, None, None, True, False, None, None, True, (), starts)
+        is_tied = packet.is_tied and vo.keyframe_id == previous.id
+        return KeyframeRecord(
+            keyframe.id, keyframe.t_ns, vo.T_keyframe_body if is_tied else None, vo.covariance if is_tied else None,
+            True, False, None, None, True, is_tied, (), starts,
+        )  # fmt: skip
     if keyframe.t_ns <= previous.t_ns:
         raise DataError(f"{what}: time must increase, the previous keyframe is at {previous.t_ns} ns")
     T: Array | None = None

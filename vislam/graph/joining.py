@@ -33,6 +33,9 @@ _SUBMAP_TILT_SIGMA_DEG = 5.0  # roll and pitch, where gravity is known on both s
 JOIN_FRAMES = 2
 _JOIN_WAITING = 20  # newest loops between submaps that are compared for that; bounds the work
 _JOIN_MAX_CONTRADICTING = 0.25  # of the loops between two submaps; more, and they wait for further ones
+_REACH_SIGMAS = 6.0  # of a tie, within which a place counts as possible beside another one
+_NEAR_REACH_M, _FRAME_REACH_M = 2.0, 0.5  # beyond the one, a frame more for each of the other ...
+_MOST_FRAMES = 10  # ... up to so many
 _NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 _MIN_RAY_ANGLE_RAD = np.deg2rad(5.0)  # between two directions that are to fix a place
 
@@ -72,21 +75,69 @@ class Waiting:
         self._edges = [e for e in self._edges if not submaps.are_joined(e.record.from_id, e.record.to_id)]
         return joined
 
-    def place(self, submaps: Submaps, poses: Array, known: RelativeCovariance) -> Placement | None:
+    def place(
+        self,
+        submaps: Submaps,
+        poses: Array,
+        known: RelativeCovariance,
+        tie: RelativeCovariance | None = None,
+        repeats_m: Callable[[], float] = lambda: np.inf,
+    ) -> Placement | None:
         """Return where the newer of two groups belongs, if enough of its loops agree on that; those wait no longer.
 
-        `poses` [M, 4, 4] are those of all keyframes, good within each group; `known` says how good.
+        Loops that contradict the tie between two groups wait, and so do all while as many speak for another place that
+        the tie does not exclude either: a wall of equal panels fits one panel further as well.
+
+        Args:
+            submaps: of all keyframes.
+            poses: [M, 4, 4] of all keyframes, good within each group.
+            known: says how good.
+            tie: says how good they are between keyframes of groups that are tied; None: none are.
+            repeats_m: says how far a place is from the next one that is known to look like it.
         """
         pairs = [(submaps.group(e.record.from_id), submaps.group(e.record.to_id)) for e in self._edges]
         for pair in sorted({(min(p), max(p)) for p in pairs}):
             edges = [e for e, p in zip(self._edges, pairs, strict=True) if (min(p), max(p)) == pair]
             if len({e.record.to_id for e in edges}) < JOIN_FRAMES:
                 continue
-            found = self._place(edges, _Ends(poses, submaps, pair[1]), known)
-            if found is not None:
+            ends = _Ends(poses, submaps, pair[1])
+            tied = [] if tie is None else [e.record for e in edges if e.record.has_scale]
+            tied = [r for r in tied if submaps.are_tied(r.from_id, r.to_id)]
+            ties = {r.id: tie(r.from_id, r.to_id) for r in tied} if tie is not None else {}
+            fitting = [e for e in edges if e.record.id not in ties or self._fits(e, ties[e.record.id], ends)]
+            found = self._place(fitting, ends, known)
+            if found is not None and not self._has_rival(found, edges, ties, ends, repeats_m()):
                 self._edges = [e for e in self._edges if all(e is not other for other in found[1])]
                 return Placement(pair[1], *found)
         return None
+
+    def _fits(self, edge: LoopModel, tie: Array, ends: _Ends) -> bool:
+        """Return whether a loop agrees with the covariance [6, 6] of the tie between its ends."""
+        return edge.chi2(*ends.of(edge, np.eye(4)), tie) < self._limit
+
+    def _has_rival(
+        self,
+        found: tuple[Array, list[LoopModel]],
+        edges: list[LoopModel],
+        ties: dict[int, Array],
+        ends: _Ends,
+        repeats_m: float,
+    ) -> bool:
+        """Return whether another place within reach of the tie speaks against one, or too few frames for it.
+
+        The farther the tie reaches the more frames have to agree: to each of them another panel may look most alike.
+        """
+        T, agreeing = found
+        sigmas_m = [np.sqrt(np.linalg.eigvalsh(ties[e.record.id][3:, 3:])[-1]) for e in agreeing if e.record.id in ties]
+        if not sigmas_m:
+            return False
+        reach_m = _REACH_SIGMAS * max(sigmas_m)
+        more = int(max(reach_m - _NEAR_REACH_M, 0.0) / _FRAME_REACH_M)
+        if len({e.record.to_id for e in agreeing}) < min(JOIN_FRAMES + more, _MOST_FRAMES):
+            return True
+        others = [e for e in edges if e.record.has_scale and all(e is not one for one in agreeing)]
+        rivals = [e for e in others if np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]) < reach_m]
+        return repeats_m < reach_m or len(rivals) > _JOIN_MAX_CONTRADICTING * (len(rivals) + len(agreeing))
 
     def _place(
         self, edges: list[LoopModel], ends: _Ends, known: RelativeCovariance
@@ -211,9 +262,9 @@ class Joining:
         """Return the loops between submaps that are not joined, oldest first."""
         return self._waiting.edges
 
-    def begin(self, k: int) -> None:
-        """Let a submap begin with keyframe k."""
-        self.submaps = self.submaps.begun(k)
+    def begin(self, k: int, is_tied: bool) -> None:
+        """Let a submap begin with keyframe k; `is_tied` as in KeyframePacket."""
+        self.submaps = self.submaps.begun(k, is_tied)
 
     def restore(self, waiting: list[LoopModel]) -> None:
         """Take over the loops that waited in an earlier run, once the submaps and the other loops are there."""
@@ -237,8 +288,9 @@ class Joining:
 
     def join(self, touched: list[int], notes: list[str]) -> list[LoopModel]:
         """Join submaps as far as loops between them agree; return those that waited and can be gated now."""
-        loops = self._loops
-        while (found := self._waiting.place(self.submaps, self._estimator.poses, self._known)) is not None:
+        loops, place = self._loops, self._waiting.place
+        tie, repeats_m = loops.gate.relative_covariance, loops.repeats_m
+        while (found := place(self.submaps, self._estimator.poses, self._known, tie, repeats_m)) is not None:
             touched += [m.record.id for m in found.agreeing]
             self._bring(found, notes)
             witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"
@@ -263,7 +315,7 @@ class Joining:
         self._estimator.look_at(every.tolist())
         poses = self._estimator.poses.copy()
         poses[ids] = found.T_map_moved @ poses[ids]
-        for k in relinked(self.submaps, ids):
+        for k in [k for k in relinked(self.submaps, ids) if k not in self.submaps.tied_ids]:
             self._source.relink(k, invert(poses[k - 1]) @ poses[k])
         notes.append(self._estimator.move(ids, found.T_map_moved))
         notes.append(
@@ -294,11 +346,14 @@ def weak_link(
 ) -> KeyframeRecord:  # fmt: skip
     """Return the record of a keyframe that begins a submap, tied to the one before as loosely as it deserves.
 
-    The motion is what odom makes of it, a guess for the eye. Without any tie the equations had no unique solution.
+    By habit where that is known, see `KeyframeRecord.is_tied`; else the motion is what odom makes of it, a guess for
+    the eye. Without any tie the equations had no unique solution.
 
     Raises:
         DataError: a pose in odom is none.
     """
+    if record.is_tied:
+        return record
     T = np.eye(4)
     if T_odom_before is not None and T_odom_body is not None:
         T = checked_pose(invert(T_odom_before) @ T_odom_body, f"keyframe {record.id}: its motion in odom")

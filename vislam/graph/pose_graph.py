@@ -128,9 +128,10 @@ class PoseGraph:
         self.readings.recall(memory.own)
         for packet, record in zip(memory.packets, self._keyframes, strict=True):
             self.readings.append(record, packet.readings)
-        for k in [record.id for record in self._keyframes if record.begins_submap]:
-            self._joining.begin(k)
-            self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
+        for k, is_tied in [(record.id, record.is_tied) for record in self._keyframes if record.begins_submap]:
+            self._joining.begin(k, is_tied)
+            if not is_tied:
+                self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
         models = [LoopModel(r, self._config, self._lever_m) for r in self._journal if isinstance(r, LoopRecord)]
         by_place = sort_loops(memory.loops, {m.id: m for m in models})
         in_graph, spare = by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE]
@@ -194,7 +195,7 @@ class PoseGraph:
             notes = [step.note, note]
         self._keyframes.append(record)
         if record.begins_submap:
-            self._joining.begin(record.id)
+            self._joining.begin(record.id, record.is_tied)
             notes.append(
                 f"keyframe {record.id} begins submap {len(self._joining.submaps.groups) - 1} of the trajectory"
             )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vislam.config import LoopConfig
 from vislam.core.camera import Rig
-from vislam.core.geometry import invert_many, transform_points
+from vislam.core.geometry import invert, invert_many, transform_points
 from vislam.core.memory import PlacesMemory, TagSighting, WordsMemory
 from vislam.core.messages import (
     Array,
@@ -100,6 +100,7 @@ class LoopCloser:
         T_map_body: Array,
         begins_submap: bool = False,
         tags: tuple[TagSighting, ...] | None = None,
+        is_tied: bool = False,
     ) -> tuple[list[LoopEdge], list[LoopCandidate]]:
         """Look for loops that a new keyframe closes.
 
@@ -108,6 +109,7 @@ class LoopCloser:
             T_map_body: its current estimate [4, 4].
             begins_submap: no odometry ties it to the one before.
             tags: that it saw; None: they are looked for in its image.
+            is_tied: but habit does, so that `T_map_body` means something.
 
         Returns:
             Verified edges, to be offered to the graph, and every candidate with its decision and reason. Raises
@@ -117,7 +119,7 @@ class LoopCloser:
             return [], []
         view = make_view(keyframe, self._rig)
         if begins_submap and len(self._poses):
-            self._submaps = self._submaps.begun(view.id)
+            self._submaps = self._submaps.begun(view.id, is_tied)
         self._poses.add(view.id, T_map_body)
         if tags is None:
             tags = self._look_for_tags(keyframe)
@@ -165,6 +167,10 @@ class LoopCloser:
         near = _apart(self._near(view), order, 0)
         wanted = max(config.max_appearance, config.max_verifications - len(order) - len(near))
         alike = _apart(self._alike(view), order, config.island_gap)[: wanted if config.max_appearance else 0]
+        last = int(old[-1]) if len(old) else view.id
+        if not self._submaps.are_joined(last, view.id) and self._submaps.are_tied(last, view.id):
+            order, near = order + near, []  # what was seen last before a loss tells where it went on
+            alike = _apart(alike, order, 0)
         near = _apart(near, alike, config.island_gap)
         for turn in range(max(len(near), len(alike))):
             order += alike[turn : turn + 1] + near[turn : turn + 1]
@@ -208,8 +214,8 @@ class LoopCloser:
         """Return candidates by odometry: old keyframes that should see most of the same by the current map."""
         config = self._config
         old = self._old(view)
-        if len(self._submaps.groups) > 1:  # poses in submaps that are not joined mean nothing to each other
-            old = old[self._submaps.groups_of(self._poses.ids[old]) == self._submaps.group(view.id)]
+        if len(self._submaps.groups) > 1:
+            old = old[[self._is_placed(k, view.id) for k in self._poses.ids[old].tolist()]]
         if len(old) == 0:
             return []
         T_body_cam = self._rig.T_body_cams[0]
@@ -219,6 +225,10 @@ class LoopCloser:
             invert_many(self._poses.poses[old] @ T_body_cam), self._bounds, config.max_odometry, _MIN_OVERLAP,
             _MIN_APART_KEYFRAMES,
         )  # fmt: skip
+
+    def _is_placed(self, one: int, other: int) -> bool:
+        """Whether the poses of two keyframes mean something to each other: in submaps that are joined or tied."""
+        return self._submaps.are_joined(one, other) or self._submaps.are_tied(one, other)
 
     def _probes(self, view: View) -> Array:
         """Return some points [P, 3] that cam0 sees; without depth, features pushed out to a nominal one."""
@@ -240,7 +250,9 @@ class LoopCloser:
 
     def _verified(self, candidate: Candidate, view: View) -> Verification:
         self.counters["verified"] += 1
-        found = self._verifier.verify(self._views[candidate.id], view, self._likeness.get(candidate.id))
+        is_placed = self._is_placed(candidate.id, view.id)
+        T_guess = invert(self._poses[candidate.id]) @ self._poses[view.id] if is_placed else None
+        found = self._verifier.verify(self._views[candidate.id], view, self._likeness.get(candidate.id), T_guess)
         if found.T_a_b is None and candidate.source == "tag":
             return self._tags.verify(candidate.id, view.id, self._rig.T_body_cams[0], self._config) or found
         return found

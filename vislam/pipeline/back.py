@@ -123,7 +123,10 @@ class Back:
         if self.loops is not None:
             with self.clock.measure("loop"):
                 edges, candidates = self.loops.detect(
-                    keyframe, self.T_map_odom @ odometry.T_odom_body, odometry.packet.begins_submap
+                    keyframe,
+                    self.T_map_odom @ odometry.T_odom_body,
+                    odometry.packet.begins_submap,
+                    is_tied=odometry.packet.is_tied,
                 )
             if self._by_depth is not None:
                 with self.clock.measure("depth in map"):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from vislam.core.geometry import invert
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert, se3_adjoint, se3_log
+from vislam.core.memory import Learned
 from vislam.core.messages import (
     Array,
     ImuSpan,
@@ -14,10 +18,13 @@ from vislam.core.messages import (
     NavState,
     Tracking,
     VoMeasurement,
+    no_observations,
 )
-from vislam.frontend import TrackResult
-from vislam.frontend.result import scaled_motion
+from vislam.frontend import FrontEnd, TrackResult
+from vislam.frontend.result import lost_motion, scaled_motion
+from vislam.pipeline.coasting import Coasting
 
+_CONTRADICTION = chi_square_limit(0.9999, 6)
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
 
 
@@ -45,6 +52,9 @@ class KeyframeChain:
         self._T_odom_keyframe: Array | None = None
         self._rests = True  # since the keyframe
         self._variance_m2 = 0.0  # of the filter's position there
+        self._is_lost = False
+        self._coasting = Coasting()
+        self._placed: tuple[Array, Array] | None = None  # newest frame that was: motion, covariance
         self._most_m2 = submap_sigma_m**2
 
     def begin_at(self, T_vo_body: Array) -> None:
@@ -53,9 +63,24 @@ class KeyframeChain:
 
     def follow(self, vo: VoMeasurement, at_rest: bool) -> None:
         """Take a frame's motion since the keyframe, and whether the body rested over it."""
-        self._rests = self._rests and at_rest
+        self._rests, self._is_lost = self._rests and at_rest, vo.tracking is Tracking.LOST
         if vo.T_keyframe_body is not None:
             self.T_vo_body = self._T_vo_keyframe @ scaled_motion(vo)
+            if vo.has_scale:
+                self._placed = vo.T_keyframe_body, vo.covariance
+                self._coasting.follow(vo.t_ns, self.T_vo_body)
+        elif (coasted := self._coasted(vo.t_ns)) is not None:
+            self.T_vo_body = self._T_vo_keyframe @ coasted[0]
+
+    def contradicts(self, vo: VoMeasurement) -> bool:
+        """Return whether a keyframe is found again, after a loss, where the body cannot have come: it looks alike."""
+        if not self._is_lost or vo.tracking is Tracking.LOST or vo.T_keyframe_body is None or not vo.has_scale:
+            return False
+        coasted = self._coasted(vo.t_ns)
+        if coasted is None or vo.keyframe_id != self.id:
+            return False
+        off = se3_log(invert(coasted[0]) @ vo.T_keyframe_body)
+        return bool(off @ np.linalg.solve(coasted[1] + vo.covariance, off) > _CONTRADICTION)
 
     def by_vision(self, vo: VoMeasurement) -> Array | None:
         """Return the pose in `odom` of a frame that inertial data do not reach: vision carries the keyframe's on."""
@@ -84,9 +109,12 @@ class KeyframeChain:
             offset_s: by which the camera's stamp was moved.
         """
         begins_submap = track.vo.tracking is Tracking.LOST and not self.is_bridged(keyframe.t_ns, imu, state)
+        vo = self._with_habit(track.vo) if begins_submap and imu is None else track.vo
         begins_submap = begins_submap or keyframe.id == self.first_id > 0
+        if begins_submap:
+            self._coasting.restart()
         at_rest = self._rests and self.id >= 0
-        return KeyframePacket(keyframe, track.vo, track.observations, imu, self.mag, at_rest, offset_s, begins_submap)
+        return KeyframePacket(keyframe, vo, track.observations, imu, self.mag, at_rest, offset_s, begins_submap)
 
     def extend(self, keyframe: Keyframe, T_odom_body: Array | None, state: NavState | None) -> None:
         """Make a keyframe, whose packet is made, the newest."""
@@ -95,6 +123,7 @@ class KeyframeChain:
         self._rests, self.mag = True, None
         self._T_vo_keyframe = self.T_vo_body.copy()
         self._T_odom_keyframe = T_odom_body
+        self._placed = np.eye(4), np.zeros((6, 6))
 
     def place(self, T_odom_keyframe: Array | None) -> None:
         """Take where the newest keyframe is in `odom` [4, 4], None: that is not known."""
@@ -108,6 +137,7 @@ class KeyframeChain:
     def stand_up(self, T_upright: Array) -> None:
         """Turn `vo` by T_upright [4, 4]: it is `odom` from now on."""
         self._T_vo_keyframe, self.T_vo_body = T_upright @ self._T_vo_keyframe, T_upright @ self.T_vo_body
+        self._coasting.restart()
 
     def is_bridged(self, t_ns: int, imu: ImuSpan | None, state: NavState | None) -> bool:
         """Return whether inertial data since the keyframe tie a frame to it that vision does not.
@@ -119,6 +149,33 @@ class KeyframeChain:
         if not np.isfinite(self._variance_m2):
             return (t_ns - self.t_ns) * 1e-9 <= _BLIND_S
         return bool(_variance_m2(state) - self._variance_m2 <= self._most_m2)
+
+    def _coasted(self, t_ns: int) -> tuple[Array, Array] | None:
+        """Return the motion [4, 4] since the keyframe at constant velocity from the last placed frame on.
+
+        And its covariance [6, 6]; None before there is a velocity.
+        """
+        ahead = self._coasting.ahead(t_ns)
+        if ahead is None or self._placed is None:
+            return None
+        back = se3_adjoint(invert(ahead[0]))
+        return self._placed[0] @ ahead[0], back @ self._placed[1] @ back.T + ahead[1]
+
+    def _with_habit(self, vo: VoMeasurement) -> VoMeasurement:
+        """Return the measurement of a frame that vision lost, with the motion that habit makes likely."""
+        coasted = self._coasted(vo.t_ns)
+        if coasted is None or vo.T_keyframe_body is not None:
+            return vo
+        return replace(vo, T_keyframe_body=coasted[0], covariance=coasted[1], has_scale=True)
+
+
+def believed(track: TrackResult, chain: KeyframeChain, frontend: FrontEnd) -> TrackResult:
+    """Return a track; lost, and the front end begins anew, where the keyframe is found where the body cannot be."""
+    if not chain.contradicts(track.vo):
+        return track
+    frontend.begin_at(chain.id + 1, Learned(frontend.learned.next_track_id), seeks_place=True)
+    vo = lost_motion(track.vo.t_ns, chain.id, track.vo.has_scale)
+    return TrackResult(vo, no_observations(), None, 0.0, "what was found looks like the keyframe, too far away")
 
 
 def _variance_m2(state: NavState | None) -> float:

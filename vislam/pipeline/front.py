@@ -31,7 +31,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.imu import ImuNoise
-from vislam.pipeline.chain import KeyframeChain
+from vislam.pipeline.chain import KeyframeChain, believed
 from vislam.pipeline.dark import Waypoints, unseen_keyframe
 from vislam.pipeline.front_report import FrontReport, RunWatch, report_of
 from vislam.pipeline.gravity import GravityWait, Phase, Start
@@ -212,6 +212,7 @@ class Front:
     def _track(self, frame: Frame, since: Since) -> TrackResult:
         """Return where visual odometry has a frame; as a keyframe also where only the filter knows the way."""
         track = self.frontend.track(frame, since.unbiased, since.gyro_sigma_rad_s, since.T_last_now)
+        track = believed(track, self._chain, self.frontend) if self._imu is None else track
         track = self._as_waypoint(frame, self._linked(frame, track))
         return replace(track, vo=self.camera_clock.loosened(track.vo, since.span, since.state))
 

@@ -51,6 +51,10 @@ class LoopSet:
         """Return how many loops are pending."""
         return len(self._pending.edges)
 
+    def repeats_m(self) -> float:
+        """Return how far a place is from the next one that is known to look like it, see PendingLoops."""
+        return self._pending.repeats_m(self._held.ends)
+
     @property
     def held(self) -> list[LoopModel]:
         """Return the loops that the graph holds, with a factor or in spare."""

@@ -8,14 +8,14 @@ rotation and direction. The covariance is that of the fit, inflated and floored 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import LoopConfig
 from vislam.core.camera import Rig
-from vislam.core.geometry import invert, se3_adjoint
+from vislam.core.geometry import invert, se3_adjoint, transform
 from vislam.core.messages import Array
 from vislam.loop.verification.epipolar import relative_direction
 from vislam.loop.verification.guided import match_guided
@@ -26,6 +26,9 @@ from vislam.vision.locate import pnp
 from vislam.vision.ransac import usac
 
 _GUIDED_RADIUS_PX = 8.0  # search around a point's predicted place once a pose is known
+_SEARCH_RADIUS_PX = 24.0  # and where only its turn is known
+_ALIKE_M = 0.25  # farther from where the map has it, a second place may fit
+_TWICE = 2  # times the inliers that a pose needs: those that PnP found fit one pose without any guess
 # of a keypoint; only its ratio to the depth sigma matters, residuals set the scale
 _FEATURE_SIGMA_PX = 1.0
 _EPIPOLAR_PX = 1.5  # Sampson error of an inlier where no depth is known
@@ -70,8 +73,11 @@ class Verifier:
         """Match an older view a with a newer view b and say whether they are worth verifying."""
         return compare(a, b, self._config, self._px)
 
-    def verify(self, a: View, b: View, known: Likeness | None = None) -> Verification:
-        """Verify an older view a against a newer view b, whose likeness may be known; deterministic for a pair."""
+    def verify(self, a: View, b: View, known: Likeness | None = None, T_guess: Array | None = None) -> Verification:
+        """Verify an older view a against a newer view b, whose likeness may be known; deterministic for a pair.
+
+        `T_guess` [4, 4] is where the map has the body at b, as seen from the body at a; None: it does not know.
+        """
         config = self._config
         pairs = (known or self.compare(a, b)).pairs
         if len(pairs) < config.min_inliers:
@@ -86,7 +92,25 @@ class Verifier:
             count = 0 if found is None else found[1]
             reason = f"too few matches fit one pose: {count} of {len(pairs)}, needs {config.min_inliers}"
             return Verification(reason, len(pairs), count, pairs=pairs)
-        return self._refine(a, b, found[0], len(pairs), found[1])
+        verified = self._refine(a, b, found[0], len(pairs), found[1])
+        return verified if T_guess is None else self._nearest(a, b, verified, T_guess)
+
+    def _nearest(self, a: View, b: View, found: Verification, T_guess: Array) -> Verification:
+        """Return what fits nearest to where the map has it: a wall of equal panels fits one panel further as well."""
+        if found.T_a_b is None:
+            return found
+        off_m = float(np.linalg.norm(found.T_a_b[:3, 3] - T_guess[:3, 3]))
+        if off_m <= _ALIKE_M:
+            return found
+        T = transform(np.ascontiguousarray(found.T_a_b[:3, :3]), np.ascontiguousarray(T_guess[:3, 3]))
+        T_cams = invert(self._T_body_cam) @ T @ self._T_body_cam
+        for radius_px in (_SEARCH_RADIUS_PX, _GUIDED_RADIUS_PX):
+            again = self._refine(a, b, T_cams, found.matches, found.inliers, radius_px)
+            if again.T_a_b is None or again.supporters < _TWICE * self._config.min_inliers:
+                return found
+            T_cams = invert(self._T_body_cam) @ again.T_a_b @ self._T_body_cam
+        nearer = again.T_a_b is not None and np.linalg.norm(again.T_a_b[:3, 3] - T_guess[:3, 3]) < 0.5 * off_m
+        return replace(again, inliers=min(again.inliers, again.supporters)) if nearer else found
 
     def _pnp(self, a: View, b: View, pairs: NDArray[np.int64]) -> tuple[Array, int] | None:
         """Return T_a_b [4, 4] of the cameras and its inliers, from the side that knows more matched points."""
@@ -104,9 +128,11 @@ class Verifier:
             return None
         return (invert(found[0]) if a_to_b else found[0]), found[1]
 
-    def _refine(self, a: View, b: View, T_a_b: Array, matches: int, inliers: int) -> Verification:
+    def _refine(
+        self, a: View, b: View, T_a_b: Array, matches: int, inliers: int, radius_px: float = _GUIDED_RADIUS_PX
+    ) -> Verification:
         config = self._config
-        radius, limit = _GUIDED_RADIUS_PX * self._px, INLIER_PX * self._px
+        radius, limit = radius_px * self._px, INLIER_PX * self._px
         sigma_xy = _FEATURE_SIGMA_PX * self._px
         refined, matched = None, Matched(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 2)))
         support, agreeing = matched, np.empty(0, np.bool_)

@@ -1,0 +1,59 @@
+"""Where a body goes that nothing measures: the spread that is stated covers how far motions really are from habit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import invert, se3_log, so3_exp, transform
+from vislam.pipeline.coasting import Coasting
+from vislam.sim.motion.motions import world_motion
+
+NS = 1_000_000_000
+
+
+@pytest.mark.parametrize("name", ["laps", "stop-and-go", "cart-laps"])
+def test_the_stated_covariance_covers_how_far_worlds_are_from_constant_velocity(name: str) -> None:
+    spline = world_motion(name, np.random.default_rng(5), 60.0)
+    t_s = np.arange(0.0, 59.0, 0.1)
+    poses, coasting, beyond, asked = spline.at(t_s).T_world_body, Coasting(), 0, 0
+    for k, T in enumerate(poses[:-30]):
+        coasting.follow(round(t_s[k] * NS), T)
+        for ahead in (2, 5, 10, 25) if k > 20 else ():
+            found = coasting.ahead(round(t_s[k + ahead] * NS))
+            assert found is not None
+            off = se3_log(invert(T @ found[0]) @ poses[k + ahead])
+            beyond += off @ np.linalg.solve(found[1], off) > chi_square_limit(0.99, 6)
+            asked += 1
+    assert beyond <= 0.03 * asked  # brakes and turns come at once: of 100 that should be inside, 97 are
+
+
+def test_a_body_in_steady_motion_goes_on_and_one_without_habit_nowhere() -> None:
+    coasting = Coasting()
+    assert coasting.ahead(0) is None
+    step = transform(so3_exp(np.array([0.0, 0.0, 0.02])), np.array([0.1, 0.0, 0.0]))
+    T = np.eye(4)
+    for k in range(30):
+        coasting.follow(k * NS // 10, T)
+        T = T @ step
+    short, long = coasting.ahead(round(3.0 * NS)), coasting.ahead(round(3.4 * NS))
+    assert short is not None and long is not None
+    np.testing.assert_allclose(short[0], step, atol=1e-6)
+    np.testing.assert_allclose(long[0], np.linalg.matrix_power(step, 5), atol=1e-6)
+    assert long[1][3, 3] > 50.0 * short[1][3, 3]
+    coasting.restart()
+    assert coasting.ahead(round(4.0 * NS)) is None
+
+
+def test_a_wild_motion_leaves_less_to_expect() -> None:
+    calm, wild, rng = Coasting(), Coasting(), np.random.default_rng(2)
+    T_calm, T_wild, speed = np.eye(4), np.eye(4), np.zeros(3)
+    for k in range(100):
+        speed = 0.9 * speed + 0.2 * rng.normal(size=3)
+        T_calm, T_wild = T_calm @ transform(np.eye(3), np.array([0.1, 0.0, 0.0])), T_wild @ transform(np.eye(3), speed)
+        calm.follow(k * NS // 10, T_calm)
+        wild.follow(k * NS // 10, T_wild)
+    one, other = calm.ahead(105 * NS // 10), wild.ahead(105 * NS // 10)
+    assert one is not None and other is not None
+    assert other[1][3, 3] > 10.0 * one[1][3, 3]

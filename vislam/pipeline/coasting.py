@@ -1,0 +1,91 @@
+"""Where a body goes while nothing measures it: on at its velocity, as uncertain as its motion before was changeable.
+
+Without inertial data a loss of sight is bridged by habit: white noise of acceleration turns a constant twist into a
+spread that grows with the cube of time (Bar-Shalom et al., "Estimation with Applications to Tracking and Navigation",
+2001, section 6.2.2). How strong that noise is shows each time how far a body was from where it would have coasted to.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+
+from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.messages import Array
+
+_NS = 1_000_000_000
+_LAGS_S = 0.1 * 2.0 ** np.arange(6)  # after which it is asked how far coasting would have led
+_TWIST_S = 0.09  # over which a velocity is taken, at least: shorter, noise of poses is most of it
+_RECENT_S = 3.0  # a motion that has become wilder is wilder now
+# density of acceleration that anything that carries a camera may begin with, rad^2/s^3 and m^2/s^3: after a second 28
+# degrees and 18 cm. A body that has only stood or gone straight has not shown how it turns
+_LEAST = np.array([0.7, 0.1])
+_TAILS = 1.5  # times the sigma: motions change by fits and starts. Measured on nine of flights, hands and carts
+
+
+class Coasting:
+    """Owns the last seconds of a body's poses, and what they say of its accelerations."""
+
+    def __init__(self) -> None:
+        """Start before the first pose."""
+        self._t_ns: list[int] = []
+        self._poses: list[Array] = []
+        self._twists: list[Array] = []  # of the body, per second
+        self._sums, self._counts = np.zeros((len(_LAGS_S), 2)), np.zeros(len(_LAGS_S))
+        self._recent = np.zeros((len(_LAGS_S), 2))
+
+    def follow(self, t_ns: int, T_vo_body: Array) -> None:
+        """Take a pose [4, 4] that was measured."""
+        if self._t_ns and t_ns <= self._t_ns[-1]:
+            return
+        self._learn(t_ns, T_vo_body)
+        twist = np.zeros(6)
+        if self._t_ns:
+            k = max(self._at_or_before(t_ns - round(_TWIST_S * _NS)), 0)
+            twist = se3_log(invert(self._poses[k]) @ T_vo_body) / ((t_ns - self._t_ns[k]) / _NS)
+        self._t_ns.append(t_ns)
+        self._poses.append(T_vo_body)
+        self._twists.append(twist)
+        old = self._at_or_before(t_ns - round(2.0 * _LAGS_S[-1] * _NS))
+        if old > 0:
+            del self._t_ns[:old], self._poses[:old], self._twists[:old]
+
+    def restart(self) -> None:
+        """Forget where the body was, not how it moves: poses from now on have nothing to do with those before."""
+        self._t_ns.clear()
+        self._poses.clear()
+        self._twists.clear()
+
+    def ahead(self, t_ns: int) -> tuple[Array, Array] | None:
+        """Return the motion [4, 4] since the last pose and its covariance [6, 6]; None: there is no habit."""
+        if len(self._t_ns) < 2:
+            return None
+        dt_s = (t_ns - self._t_ns[-1]) / _NS
+        variance = np.maximum(self._density(dt_s), _LEAST) * (_TAILS**2 * dt_s**3 / 3.0)
+        return se3_exp(self._twists[-1] * dt_s), np.diag(np.repeat(variance, 3))
+
+    def _learn(self, t_ns: int, T_vo_body: Array) -> None:
+        for n, lag_s in enumerate(_LAGS_S):
+            k = self._at_or_before(t_ns - round(lag_s * _NS))
+            if k < 1:  # before the second pose there was no velocity
+                break
+            dt_s = (t_ns - self._t_ns[k]) / _NS
+            off = se3_log(invert(self._poses[k] @ se3_exp(self._twists[k] * dt_s)) @ T_vo_body)
+            density = np.array([off[:3] @ off[:3], off[3:] @ off[3:]]) / dt_s**3  # of three axes, each a third
+            self._sums[n] += density
+            self._counts[n] += 1
+            share = np.exp(-(t_ns - self._t_ns[-1]) / _NS / _RECENT_S)
+            self._recent[n] = share * self._recent[n] + (1.0 - share) * density
+
+    def _density(self, dt_s: float) -> Array:
+        """Return the density of acceleration [2], as the shortest lag that is as long shows it, or the longest seen."""
+        seen = int(np.count_nonzero(self._counts))
+        if not seen:
+            return np.zeros(2)
+        n = min(int(np.searchsorted(_LAGS_S, dt_s)), seen - 1)
+        return np.asarray(np.maximum(self._sums[n] / self._counts[n], self._recent[n]))
+
+    def _at_or_before(self, t_ns: int) -> int:
+        """Return which pose is the last one at or before a time, -1: none."""
+        return bisect_right(self._t_ns, t_ns) - 1
