@@ -31,7 +31,7 @@ from vislam.sim.worlds.simulation import open_world
 from vislam.sim.worlds.table import WORLDS, World
 from vislam.slam import Slam
 
-LENGTH_M, HALF_WIDTH_M, HEIGHT_M, SPEED_M_S = 24.0, 1.15, 2.6, 1.0
+HALF_WIDTH_M, HEIGHT_M, SPEED_M_S = 1.15, 2.6, 1.0
 WIDTH_PX = 320
 SHORTEST_S, LONGEST_S = 0.3, 3.0
 FIRST_S = 4.0  # before the first loss, and between two of them
@@ -57,13 +57,13 @@ def repeated(piece: Painter, period_m: float, seed: int) -> Painter:
     return pixels
 
 
-def add_world(name: str) -> None:
+def add_world(name: str, length_m: float) -> None:
     """Put a corridor into the table of simulated worlds; its walls repeat but at the ends, which are far away."""
     period_m = PERIODS[name]
 
     def build(rng: np.random.Generator) -> SceneBuilder:
         scene = SceneBuilder(ambient=0.9)
-        low, high, w = -4.0, LENGTH_M + 8.0, HALF_WIDTH_M
+        low, high, w = -4.0, length_m + 8.0, HALF_WIDTH_M
         texels = round(200.0 * period_m) / period_m  # a whole number of pixels to the period
         for left, right in (((low, w), (high, w)), ((high, -w), (low, -w))):
             piece = repeated(_KINDS[name.partition("-")[0]](), period_m, int(rng.integers(0, 2**31)))
@@ -75,7 +75,7 @@ def add_world(name: str) -> None:
         return scene
 
     def motion(rng: np.random.Generator) -> BodySpline:
-        path = rounded_path([(0.0, 0.0), (LENGTH_M / 2.0, 0.1), (LENGTH_M, 0.0)], 2.0)
+        path = rounded_path([(0.0, 0.0), (length_m / 2.0, 0.1), (length_m, 0.0)], 2.0)
         return walk(path, Travel(path.length_m, SPEED_M_S, 1.0, 2.0, 1.0), int(rng.integers(0, 2**31)))
 
     WORLDS[name] = World(f"a corridor that repeats every {period_m} m", build, motion, "rgbd", 10.0, (0.06, 0.02, 0.04),
@@ -140,10 +140,10 @@ def losses_of(rng: np.random.Generator, duration_s: float, most: int) -> list[tu
     return out
 
 
-def run(name: str, rig: str, most: int, seed: int) -> list[Loss]:
+def run(name: str, rig: str, most: int, seed: int, length_m: float) -> list[Loss]:
     """Return what became of each loss in one world."""
     if name not in WORLDS:
-        add_world(name)
+        add_world(name, length_m)
     world = open_world(name, seed, rig=rig, image_width_px=WIDTH_PX, workers=2)
     recording = Darkened(world, losses_of(np.random.default_rng([seed, len(name)]), world.duration_s, most))
     config = load(
@@ -182,13 +182,14 @@ def main() -> None:
     parser.add_argument("--worlds", nargs="+", choices=PERIODS, default=list(PERIODS))
     parser.add_argument("--rig", choices=("rgbd", "stereo", "mono"), default="rgbd")
     parser.add_argument("--losses", type=int, default=4, help="in each world, at most")
+    parser.add_argument("--length-m", type=float, default=24.0, help="of the walk")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="a JSON file for the losses")
     asked = parser.parse_args()
     print(f"seed {asked.seed}")
     losses = list[Loss]()
     for name in asked.worlds:
-        for loss in run(name, asked.rig, asked.losses, asked.seed):
+        for loss in run(name, asked.rig, asked.losses, asked.seed, asked.length_m):
             losses.append(loss)
             word = "FALSE" if loss.is_false else "joined" if loss.is_joined else "apart"
             print(

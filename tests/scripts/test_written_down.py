@@ -44,6 +44,7 @@ CART = "sim:cart-drive,image_width_px=320,camera_hz=10,exposure_s=0,duration_s=3
 # {cart}: 3 s of a cart over a floor, {graph}: a pose graph of 60 poses, {plan}: a plan of one start.
 # What takes minutes whatever its input has --help: it is imported, and understands its options.
 SMALLEST = {
+    "experiments/aliasing.py": "--worlds panels-2.0 --losses 1 --length-m 9",
     "experiments/cart_wheels.py": "--seeds 0 --duration-s 12 --blind-at-s 4 --radii 'as told'",
     "experiments/cloud_smoothing.py": "--seconds 1",
     "experiments/depth_alone.py": "--source {recording} --dark 0.5 --begin 1 --length 2.5",

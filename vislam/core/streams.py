@@ -14,6 +14,7 @@ import numpy as np
 
 _NS = 1_000_000_000
 _MEDIAN_OF = 31  # intervals, that tell the usual one
+_AT_FIRST = (3, 7, 15)  # of the first ones, too
 _HOLE = 2.5  # usual intervals
 _MOST_EVENTS = 50  # of one kind; what comes later is counted with the last
 _TOGETHER_NS = _NS // 2  # what happens again so soon is the same event
@@ -105,7 +106,7 @@ class StreamJudge:
         kinds = (Happening.UNUSABLE, Happening.DUPLICATE, Happening.LATE, Happening.STUCK)
         self.refused: dict[str, int] = dict.fromkeys(map(str, kinds), 0)
         self._stream, self._most, self._hole_ns = stream, most, round(hole_s * _NS)
-        self.usual_ns = 0
+        self.usual_ns, self._is_new = 0, True
         self._newest_ns: int | None = None
         self._is_refused = False  # what came since then, so that a hole behind it has a name already
         self._intervals_ns: list[int] = []  # since `usual_ns` was taken
@@ -190,6 +191,8 @@ class StreamJudge:
         if self.usual_ns and step_ns > max(self._hole_ns, _HOLE * self.usual_ns):
             self.note(Happening.HOLE, before_ns, t_ns, round(step_ns / self.usual_ns) - 1)
         self._intervals_ns.append(step_ns)
-        if len(self._intervals_ns) == _MEDIAN_OF:
+        if len(self._intervals_ns) == _MEDIAN_OF or (len(self._intervals_ns) in _AT_FIRST and self._is_new):
             self.usual_ns = int(np.median(self._intervals_ns))
+        if len(self._intervals_ns) == _MEDIAN_OF:
             self._intervals_ns.clear()
+            self._is_new = False

@@ -34,8 +34,7 @@ JOIN_FRAMES = 2
 _JOIN_WAITING = 20  # newest loops between submaps that are compared for that; bounds the work
 _JOIN_MAX_CONTRADICTING = 0.25  # of the loops between two submaps; more, and they wait for further ones
 _REACH_SIGMAS = 6.0  # of a tie, within which a place counts as possible beside another one
-_NEAR_REACH_M, _FRAME_REACH_M = 2.0, 0.5  # beyond the one, a frame more for each of the other ...
-_MOST_FRAMES = 10  # ... up to so many
+_FRAME_REACH_M = (2.0, 5.0)  # beyond each of which one frame more has to agree
 _NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
 _MIN_RAY_ANGLE_RAD = np.deg2rad(5.0)  # between two directions that are to fix a place
 
@@ -132,8 +131,8 @@ class Waiting:
         if not sigmas_m:
             return False
         reach_m = _REACH_SIGMAS * max(sigmas_m)
-        more = int(max(reach_m - _NEAR_REACH_M, 0.0) / _FRAME_REACH_M)
-        if len({e.record.to_id for e in agreeing}) < min(JOIN_FRAMES + more, _MOST_FRAMES):
+        more = sum(reach_m > step_m for step_m in _FRAME_REACH_M)
+        if len({e.record.to_id for e in agreeing}) < JOIN_FRAMES + more:
             return True
         others = [e for e in edges if e.record.has_scale and all(e is not one for one in agreeing)]
         rivals = [e for e in others if np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]) < reach_m]
