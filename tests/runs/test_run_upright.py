@@ -11,8 +11,9 @@ import pytest
 from needs import missing
 from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
+from vislam.core.angles import angle_deg
 from vislam.core.errors import UsageError
-from vislam.core.up import Up, angle_deg, parse_up, turn_to_z
+from vislam.core.up import Up, parse_up, turn_to_z
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.runs import execute
