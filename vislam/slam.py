@@ -55,7 +55,7 @@ class Slam:
     @property
     def counters(self) -> dict[str, int]:
         """How often the place in the map was lost and found again."""
-        return self._in_map.counters
+        return self._in_map.place.counters
 
     def resume(self, memory: SlamMemory) -> GraphUpdate:
         """Go on where an earlier run was, before the first value; return all its poses.
@@ -65,7 +65,7 @@ class Slam:
         """
         self.front.resume(memory.front)
         update = self._intake.resume(memory)
-        self._in_map.begin(update.submaps)
+        self._in_map.place.submaps = update.submaps
         return update
 
     def begin_in_map(self, memory: SlamMemory) -> GraphUpdate:
@@ -77,7 +77,7 @@ class Slam:
         first_id = memory.front.keyframe_id + 1
         self.front.begin_in_map(first_id, memory.front.learned.next_track_id)
         update = self._intake.begin_in_map(memory)
-        self._in_map.begin(update.submaps.begun(first_id))
+        self._in_map.place.submaps = update.submaps.begun(first_id)
         return update
 
     def feed(self, value: ImuSample | MagSample | Reading | Frame) -> list[Step]:
@@ -115,6 +115,6 @@ class Slam:
         front = self.front.process(frame)
         keyframes = self._intake.add(front.keyframes)
         self._intake.see(front)
-        T_map_body = self._in_map.publish(front, None if self.back is None else self.back.T_map_odom)
-        localisation = self._in_map.localise(front.track.vo.tracking, keyframes)
-        return Step(front, T_map_body, localisation, self._in_map.submap, keyframes)
+        T_map_odom = None if self.back is None else self.back.T_map_odom
+        T_map_body, localisation = self._in_map.take(front, keyframes, T_map_odom)
+        return Step(front, T_map_body, localisation, self._in_map.place.submap, keyframes)

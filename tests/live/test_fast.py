@@ -147,6 +147,31 @@ def test_a_correction_by_vision_or_by_the_map_is_no_step_of_the_published_pose(w
     np.testing.assert_allclose(poses[-1].T_map_base[:3, 3], there[:3, 3], atol=0.02)
 
 
+def test_a_place_that_is_found_is_taken_at_once_and_none_is_claimed_before(world: VisionWorld) -> None:
+    """In the map of another run: what was half a metre off until then is not paid back with motion; odom never jumps.
+
+    What comes after is: ten centimetres more are no step of the pose in map.
+    """
+    begin_ns, found_ns, later_ns = (T0_NS + int(s * 1e9) for s in (0.1, 4.0, 6.0))
+    found, later = (transform(np.eye(3), np.array([x, -0.4, 0.0])) for x in (0.3, 0.4))
+    moves = [MapMoved(3, np.eye(4), False), MapMoved(4, found, True), MapMoved(5, later, True)]
+    others = list(zip((begin_ns, found_ns, later_ns), moves, strict=True))
+    _, poses, _ = run(world, others=others)
+    _, without, _ = run(world)
+    for pose, same in zip(poses, without, strict=True):
+        np.testing.assert_array_equal(pose.T_odom_base, same.T_odom_base)
+    nowhere = {pose.t_ns for pose in poses if Health.NOT_IN_MAP in pose.health}
+    assert nowhere == {pose.t_ns for pose in poses if begin_ns <= pose.t_ns < found_ns}
+    smoothed = [invert(same.T_map_odom) @ pose.T_map_odom for pose, same in zip(poses, without, strict=True)]
+    off_m = {pose.t_ns: np.linalg.norm((T - found)[:3, 3]) for pose, T in zip(poses, smoothed, strict=True)}
+    first_ns = min(t for t in off_m if t >= found_ns)
+    print(f"off where it was found by {1e3 * off_m[first_ns]:.2f} mm")
+    assert off_m[first_ns] < 0.02  # what corrections of the filter are still owed in odom
+    steps = np.abs(np.diff([off_m[t] for t in sorted(off_m) if t >= later_ns - 10_000_000]))
+    assert steps.max() < 0.01
+    assert off_m[max(off_m)] == pytest.approx(0.1, abs=0.02)
+
+
 def test_an_outage_is_dead_reckoning_at_once_invalid_by_sigma_and_over_when_vision_is_back() -> None:
     world = VisionWorld.make(seed=6, duration_s=24.0).lost(6.0, 16.0)
     lost = lost_motion(T0_NS + int(6e9), 6, True)

@@ -38,6 +38,11 @@ def is_found(run: LiveRun) -> bool:
     return bool(run.notes.get("map", {}).get("found_in_map"))
 
 
+def is_placed(run: LiveRun) -> bool:
+    """Whether the published pose is in the map."""
+    return Health.NOT_IN_MAP not in Health(status(run).get("health", Health.NOT_IN_MAP))
+
+
 def test_a_run_ended_by_ctrl_c_and_a_kill_is_resumed_each_time(interrupted, tmp_path: Path) -> None:
     first, metrics = interrupted
     out = shutil.copytree(first, tmp_path / "run")
@@ -93,7 +98,10 @@ def test_a_run_begins_in_the_map_of_another(interrupted, tmp_path: Path) -> None
     out, _ = interrupted
     old = (out / "session.db").read_bytes()
     run = begin(tmp_path / "next", MapChoice(out, True), dense=True)
-    found = run.execute(until(is_found, interrupt), PATIENCE_S)
+    run.notes = Notes()
+    found = run.execute(until(lambda run: is_found(run) and is_placed(run), interrupt), PATIENCE_S)
+    assert any(Health.NOT_IN_MAP in health for health in run.notes.health)
+    assert is_placed(run)
     assert (out / "session.db").read_bytes() == old
     assert found["map"]["localize_only"] is True
     assert found["map"]["found_t_s"] is not None

@@ -105,6 +105,14 @@ def test_tf_says_where_odom_is_in_map_and_base_in_odom() -> None:
     np.testing.assert_allclose(T_map_base[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
 
 
+@needs_dds
+def test_tf_says_nothing_of_map_while_the_place_in_it_is_not_known() -> None:
+    from vislam.live.bridges.ros2 import transforms
+
+    links = transforms(known_pose(health=Health.LEVELLED | Health.NOT_IN_MAP), 1).transforms
+    assert [(link.header.frame_id, link.child_frame_id) for link in links] == [("odom", "base_link")]
+
+
 def publish_until(name: str, at: str, pose, enough) -> None:
     """Publish a pose again and again, new every time, until enough has come of it."""
     publisher = PosePublisher(name, (at,))

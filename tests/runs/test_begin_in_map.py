@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 from pathlib import Path
@@ -11,10 +12,11 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import load
-from vislam.core.geometry import invert
+from vislam.core.geometry import align_points, invert
 from vislam.loop.table import read_loops
 from vislam.runs import execute
 from vislam.runs.folder import MapChoice, prepare
+from vislam.runs.loaded import load_run
 from vislam.runs.session import Session
 from vislam.runs.sources import open_source
 from vislam.trajectory import read_tum
@@ -25,13 +27,13 @@ TODAY = "points:corridor-loop,duration_s=12,camera_hz=12,tracks=150,pixel_sigma_
 FAST = {"view.enabled": False}
 
 
-def run(source: str, out: Path, base: MapChoice | None = None, stop_at: int | None = None) -> dict:
+def run(source: str, out: Path, base: MapChoice | None = None, stop_at: int | None = None, **settings: object) -> dict:
     def stop(done: int, total: int, note: str) -> None:
         if done == stop_at:
             raise KeyboardInterrupt
 
     prepare(out, overwrite=False)
-    return execute(open_source(source), load(None, FAST), out, source, [], stop, base)
+    return execute(open_source(source), load(None, FAST | settings), out, source, [], stop, base)
 
 
 def digest(path: Path) -> str:
@@ -86,6 +88,45 @@ def test_a_run_is_found_in_the_map_of_another_which_is_not_written(localize_only
     print(f"old keyframes moved {moved_m:.2e} m, rms error in their map {error_m:.3f} m")
     assert moved_m < (3e-4 if localize_only else 0.1)  # they are held at 1 mm (1 sigma), each, and loops pull
     assert error_m < 0.06
+
+
+def test_a_place_that_is_found_is_in_map_at_once_and_no_pose_is_claimed_before(tmp_path):
+    """By vision alone, from another place; vision is lost once, and the submap after it is found in the map as well."""
+    with_depth = "points:corridor-loop,rig=rgbd,tracks=150"  # with one end both have the same landmarks
+    sources = [f"{with_depth},duration_s=12,camera_hz=10"]
+    sources += [f"{with_depth},start_s=1.5,duration_s=10.5,camera_hz=12,pixel_sigma_px=0.8"]
+    by_eye = {"imu.enabled": False, "map.enabled": False}
+    old, new = tmp_path / "old", tmp_path / "new"
+    run(sources[0], old, **by_eye)
+    metrics = run(sources[1], new, MapChoice(old, False), **by_eye)
+    assert metrics["counters"]["localisation"]["relocalised"] == 2
+    with (new / "tracking.csv").open() as file:
+        rows = {int(row["t_ns"]): row for row in csv.DictReader(file)}
+    live, truth, built = (read_tum(new / f"trajectory_{name}.tum") for name in ("live", "truth", "graph"))
+    old_truth, old_built = (read_tum(old / f"trajectory_{name}.tum") for name in ("truth", "graph"))
+    T_truth_map = align_points(old_built.positions_m, old_truth.at(old_built.t_ns)[:, :3, 3])
+    off = T_truth_map @ live.T_world_body
+    off_m = np.linalg.norm(off[:, :3, 3] - truth.at(live.t_ns)[:, :3, 3], axis=1)
+    states = [rows[t]["localisation"] for t in live.t_ns.tolist()]
+    found_m = [m for m, state in zip(off_m, states, strict=True) if state == "relocalised"]
+    known_m = [m for m, state in zip(off_m, states, strict=True) if state != "lost"]
+    print(f"off when found {np.round(1e3 * np.array(found_m))} mm, at most {1e3 * max(known_m):.0f} mm while known")
+    assert len(found_m) == 2
+    assert max(found_m) < 0.03
+    assert max(known_m) < 0.15
+    unplaced = {t for t, row in rows.items() if row["localisation"] == "lost" and row["tracking"] != "lost"}
+    assert min(rows) in unplaced
+    assert not unplaced & set(live.t_ns.tolist())
+    assert unplaced < set(built.t_ns.tolist())  # what is final has them
+
+
+def test_a_run_that_is_never_found_has_no_pose_in_the_map(yesterday, tmp_path):
+    elsewhere = TODAY.replace("tracks=150", "tracks=150,world_seed=5")
+    metrics = run(elsewhere, tmp_path / "today", MapChoice(yesterday, False))
+    assert metrics["map"]["found_t_s"] is None
+    paths = load_run(tmp_path / "today").trajectories
+    assert "live" not in paths
+    assert len(paths["graph"]) == metrics["frames"]
 
 
 def test_maps_are_chained_and_a_run_in_one_is_resumed(yesterday, tmp_path, capsys):

@@ -289,6 +289,11 @@ class Submaps:
     groups: tuple[int, ...] = (0,)  # of each submap: the oldest submap that it is joined with, itself when with none
     tied_ids: tuple[int, ...] = ()  # those of `first_ids` that habit ties to the keyframe before
 
+    @property
+    def is_joined(self) -> bool:
+        """Whether the newest submap is joined with the first, which is the map."""
+        return self.groups[-1] == 0
+
     def begun(self, keyframe_id: int, is_tied: bool = False) -> Submaps:
         """Return these submaps and a new one that begins with a keyframe; `is_tied` as in KeyframePacket."""
         ties = (*self.tied_ids, keyframe_id) if is_tied else self.tied_ids

@@ -16,6 +16,7 @@ class Health(IntFlag):
     MAG_OK = 1 << 5
     GATE_REJECT = 1 << 6  # vision contradicts the filter now
     DOUBTFUL = 1 << 7  # the run so far contradicts itself: see the verdict's reasons (status line, metrics.json)
+    NOT_IN_MAP = 1 << 8  # where odom is in map is a guess: the place was not found yet, or lost
     IMU_MISSING = 1 << 16  # no sample within the time that the source allows
     IMU_GAP = 1 << 17  # samples were lost since the last word
     ACCEL_SATURATED = 1 << 18

@@ -158,6 +158,8 @@ class FastPath:
             self._at_rest = message.at_rest
         elif isinstance(message, MapMoved):
             if message.revision >= self._map.revision:
+                if message.is_in_map and not self._map.is_in_map:
+                    self._in_map.clear()  # the place was found: map goes on from nothing
                 self._map = message
         elif isinstance(message, CameraHealth):
             self._camera = message.health
@@ -220,7 +222,7 @@ class FastPath:
 
     def _health(self, state: NavState | None, now_ns: int, age_ns: int) -> Health:
         config = self._config.live
-        health = self._camera | self._doubt
+        health = self._camera | self._doubt | (Health(0) if self._map.is_in_map else Health.NOT_IN_MAP)
         for _, event in self._events:
             health |= event
         if age_ns > _IMU_TIMEOUT_S * _NS:

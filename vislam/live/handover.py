@@ -38,7 +38,7 @@ class Seen:
     """One frame after the front half, with what was published then and what was known."""
 
     step: FrontStep
-    T_map_odom: Array  # [4, 4]
+    T_map_odom: Array | None  # [4, 4]; None: not in the map
     start: StartFacts | None
     learned: Learned
 

@@ -47,6 +47,7 @@ class MapMoved:
 
     revision: int
     T_map_odom: Array  # [4, 4]
+    is_in_map: bool = True  # its submap is joined with the map; else T_map_odom is a guess
 
 
 ToFast = Start | Correction | AppliedReading | Rebase | CameraHealth | Doubted | MapMoved

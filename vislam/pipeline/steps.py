@@ -69,7 +69,7 @@ class Step:
     """The answer to one frame: what the front half saw, the causal pose, and the keyframes that went to the back."""
 
     front: FrontStep
-    T_map_body: Array | None  # None: no pose yet
+    T_map_body: Array | None  # None: no pose yet, or its submap is not joined with the map
     localisation: Localisation
     submap: int  # of the trajectory, from 0
     keyframes: list[KeyframeStep]

@@ -413,7 +413,9 @@ class RunLog:
     def write_trajectories(self, out: Path, final: Trajectory, truth: Trajectory | None) -> None:
         """Write the TUM files of a run."""
         write_tum(self.odometry_trajectory(), out / "trajectory_ekf.tum")
-        write_tum(self.live_trajectory(), out / "trajectory_live.tum")
+        live = self.live_trajectory()
+        if len(live):  # a run that is not found in the map of another was nowhere in it
+            write_tum(live, out / "trajectory_live.tum")
         write_tum(final, out / "trajectory_graph.tum")
         if truth is not None:
             write_tum(truth, out / "trajectory_truth.tum")

@@ -27,7 +27,8 @@ def accuracy(
     errors, warnings = {}, []
     if len(log):
         span = (int(log.stamps_ns[0]), int(log.stamps_ns[-1]))
-        estimates = {"ekf": log.odometry_trajectory(), "live": log.live_trajectory(), "graph": final}
+        live = log.live_trajectory()  # empty where the run was not found in the map in which it began
+        estimates = {"ekf": log.odometry_trajectory(), **({"live": live} if len(live) else {}), "graph": final}
         for name, estimate in estimates.items():
             try:
                 errors[name] = evaluate(estimate, truth, alignment, span_ns=span)

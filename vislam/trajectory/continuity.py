@@ -4,7 +4,8 @@ An estimator corrects itself whenever a measurement comes in: the pose of one in
 steers by it takes that for motion. Here the published pose goes on as the body does, and what is still to be corrected
 is let go gradually: with the way and the turn that the body makes, and slowly in time. So at rest next to nothing
 moves, and while it moves a correction looks like an odometry that errs by some percent for a while. A correction
-that is too large for that comes at once, for it is another belief about the place, not a better one.
+that is too large for that comes at once, for it is another belief about the place, not a better one. So does the first
+answer to where the place is, by `clear`: nothing was known that the pose could go on from.
 
 Position and rotation are kept apart: a turn of the frame moves the body where it turns it, not at a lever arm.
 """

@@ -215,14 +215,14 @@ def odometry(pose: PublishedPose, stamp_ns: int) -> Odometry:
 
 
 def transforms(pose: PublishedPose, stamp_ns: int) -> TFMessage:
-    """Return map -> odom, which loops correct, and odom -> base_link, which never jumps."""
+    """Return odom -> base_link, which never jumps, and map -> odom, which loops correct, while the place is known."""
     frames = (("map", "odom", pose.T_map_odom), ("odom", "base_link", pose.T_odom_base))
     return TFMessage(
         [
             TransformStamped(
                 Header(_time(stamp_ns), parent), child, Transform(Vector3(*T[:3, 3].tolist()), _quaternion(T))
             )
-            for parent, child, T in frames
+            for parent, child, T in frames[Health.NOT_IN_MAP in pose.health :]
         ]
     )
 

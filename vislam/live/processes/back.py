@@ -6,6 +6,7 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import cv2
+import numpy as np
 
 from vislam.config import Config
 from vislam.core.camera import Rig
@@ -35,7 +36,7 @@ def run(
         rig: the cameras.
         noise: of the IMU, as it is rehearsed with.
         keyframes: `KeyframeOut` from the front process, until it closes it or is killed.
-        to_fast: `MapMoved`, one per revision.
+        to_fast: `MapMoved`, one per revision, and one before them if there is a `beginning`.
         to_map: `BackBegun` if there is a `beginning`, `KeyframeStep`, then `BackEnded`.
         beginning: the session that the run goes on from.
         suite: further sensors, whose readings come with keyframes.
@@ -50,7 +51,9 @@ def run(
     if beginning is not None:
         memory = recalled(beginning)
         back = Back(config, rig, noise, clock, memory.first_state, memory.T_start, suite)
-        _put(life, outbox, BackBegun(back.restore(memory)))
+        update = back.restore(memory)
+        _send(to_fast, MapMoved(update.revision, np.eye(4), is_in_map=False))
+        _put(life, outbox, BackBegun(update))
         del memory
     life.ready()
     while (keyframe := _next(life, inbox)) is not None:
@@ -64,7 +67,8 @@ def run(
             if begins_recording:
                 continue  # ended before gravity was known
         step = back.add(keyframe.odometry, [])
-        _send(to_fast, MapMoved(step.update.revision, step.update.T_map_odom))
+        update = step.update
+        _send(to_fast, MapMoved(update.revision, update.T_map_odom, update.submaps.is_joined))
         _put(life, outbox, step)
     if back is None:
         ended = BackEnded(None, None, None, {}, clock.summary_ms())

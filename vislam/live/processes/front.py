@@ -282,14 +282,16 @@ class FrontProcess:
         while not (box.put(value, _PUT_S) or self._life.is_orphan):
             continue
 
-    def _T_map_odom(self) -> Array:
-        """Return where `odom` is in `map` as it is published now."""
+    def _T_map_odom(self) -> Array | None:
+        """Return where `odom` is in `map` as it is published now; None while that is a guess."""
         if self._poses is None:
             try:
                 self._poses = PoseReader(self._config.live.name)
             except DataError:
                 return np.eye(4)
         pose = self._poses.latest()
+        if pose is not None and Health.NOT_IN_MAP in pose.health:
+            return None
         return np.eye(4) if pose is None else pose.T_map_odom
 
 

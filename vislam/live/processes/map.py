@@ -17,7 +17,7 @@ from vislam.config import Config
 from vislam.core.clock import StageClock
 from vislam.core.errors import HardwareError
 from vislam.core.memory import Learned, SlamMemory, StartFacts
-from vislam.core.messages import Array, GraphUpdate, Submaps
+from vislam.core.messages import Array, GraphUpdate
 from vislam.core.recording import Recording
 from vislam.live.beginning import Beginning
 from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
@@ -31,7 +31,7 @@ from vislam.mapping.mapper import Mapper
 from vislam.mapping.stage import MapStage
 from vislam.pipeline.back import MAX_SEEN, map_stage, seen_between
 from vislam.pipeline.front_report import FrontReport
-from vislam.pipeline.in_map import localised
+from vislam.pipeline.in_map import Place
 from vislam.pipeline.steps import Finish, KeyframeStep, Step
 from vislam.runs import Progress, Run, begun
 from vislam.runs.folder import MapChoice
@@ -191,7 +191,8 @@ class FollowedPipeline:
     ) -> None:
         """Follow two queues, and feed a map as fast as it can."""
         self.clock = clock
-        self.counters = {"frames_lost": 0, "relocalised": 0}
+        self._place = Place()
+        self.counters = self._place.counters
         self.front = _Front()
         self.life = life
         self.pace = pace
@@ -200,7 +201,6 @@ class FollowedPipeline:
         self._late: deque[KeyframeStep] = deque()  # whose frame has not come yet
         self._back_ended: BackEnded | None = None
         self._begun: GraphUpdate | None = None
-        self._submaps = Submaps()
         self._newest_id = -1
         self._seen: deque[SeenFrame] = deque(maxlen=MAX_SEEN)  # whose keyframe has not come yet
 
@@ -226,7 +226,7 @@ class FollowedPipeline:
             self._map.stage.restore(memory.scans, memory.graph.T_map_body, memory.held > 0)
             self._map.stage.move(update)
         self._map.graph = EndedGraph(update.ids, update.T_map_body, [], [])
-        self._submaps = update.submaps.begun(first_id)
+        self._place.submaps = update.submaps.begun(first_id)
         self._newest_id = first_id - 1
         return update
 
@@ -274,12 +274,10 @@ class FollowedPipeline:
         if self._map.stage is not None and self._map.stage.wants_frames:
             self._seen += seen_between(front)
         keyframes = self._ripe()
-        before = self._submaps
-        if keyframes:
-            self._submaps = keyframes[-1].update.submaps
-        localisation = localised(before, self._submaps, front.track.vo.tracking, self.counters)
-        T_map_body = None if front.T_odom_body is None else seen.T_map_odom @ front.T_odom_body
-        return Step(front, T_map_body, localisation, len(self._submaps.groups) - 1, keyframes)
+        localisation = self._place.localise(front.track.vo.tracking, keyframes)
+        T_odom_body, T_map_odom = front.T_odom_body, seen.T_map_odom
+        T_map_body = None if T_odom_body is None or T_map_odom is None else T_map_odom @ T_odom_body
+        return Step(front, T_map_body, localisation, self._place.submap, keyframes)
 
     def _wants_mapped(self) -> bool:
         """Return whether the map takes the next keyframe; say when it leaves one out."""

@@ -66,7 +66,7 @@ class Feed:
         with self._lock:
             self._pose = pose
             self._begin(pose.t_ns)
-            if Health.LEVELLED in pose.health:
+            if pose.health & (Health.LEVELLED | Health.NOT_IN_MAP) == Health.LEVELLED:
                 self._path.add(pose.T_map_base[:3, 3])
 
     @property

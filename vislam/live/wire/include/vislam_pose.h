@@ -23,6 +23,7 @@ enum vislam_health {
     VISLAM_MAG_OK = 1u << 5,
     VISLAM_GATE_REJECT = 1u << 6,       /* vision contradicts the filter now */
     VISLAM_DOUBTFUL = 1u << 7,          /* the run so far contradicts itself */
+    VISLAM_NOT_IN_MAP = 1u << 8,        /* map_odom is a guess */
     VISLAM_IMU_MISSING = 1u << 16,
     VISLAM_IMU_GAP = 1u << 17,
     VISLAM_ACCEL_SATURATED = 1u << 18,
