@@ -177,7 +177,7 @@ def test_another_room_gets_no_edge_by_depth_whatever_place_is_told(old, tmp_path
 )
 def test_a_start_that_is_no_pose_is_told(text):
     with pytest.raises(UsageError, match="QX,QY,QZ,QW"):
-        parse_start(text, np.eye(4))
+        parse_start(text)
 
 
 def test_a_start_without_a_map_is_told(tmp_path, capsys):

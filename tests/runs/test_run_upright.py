@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 
 from needs import missing
+from session_entries import editing
 from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
 from vislam.core.angles import angle_deg
 from vislam.core.errors import UsageError
+from vislam.core.geometry import invert
 from vislam.core.up import Up, parse_up, turn_to_z
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
 from vislam.runs import execute
 from vislam.runs.folder import MapChoice, prepare
-from vislam.runs.levelled import onto_map, with_planes
+from vislam.runs.levelled import onto_map, stored_up, with_planes
 from vislam.runs.offline.rebuild import map_settings, rebuild
 from vislam.runs.report import write_report
+from vislam.runs.session import Session
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
 from vislam.trajectory import align, associate, read_tum
@@ -218,15 +221,111 @@ def test_surfaces_that_contradict_the_accelerometer_move_nothing():
     assert with_planes(first, Up.unknown("no surfaces")) is first
 
 
-def test_a_run_in_the_map_of_another_takes_its_up(auto, source, tmp_path):
-    old, out = auto
-    prepare(tmp_path / "run", False)
-    begin = MapChoice(out, False)
-    metrics = execute(open_source(source, 0), CONFIG, tmp_path / "run", source=source, command=["test"], base=begin)
+def run_in_map(recording, base, out, up="auto"):
+    prepare(out, False)
+    begin, config = MapChoice(base, False), replace(CONFIG, up=up)
+    return execute(recording, config, out, source="again", command=["test"], base=begin)
+
+
+@pytest.fixture(scope="module")
+def again(auto, source, tmp_path_factory):
+    out = tmp_path_factory.mktemp("upright") / "again"
+    return run_in_map(open_source(source, 0), auto[1], out), out
+
+
+def stored(out):
+    """What a session has: poses in map and odom of all keyframes, and up as a run that begins in it has it."""
+    session = Session(out / "session.db")
+    keyframes, up = list(session.keyframes()), stored_up(session.info())
+    session.close()
+    return np.array([[k.T_map_body, k.T_odom_body] for k in keyframes]), up
+
+
+def test_a_run_in_the_map_of_another_takes_its_up(auto, again):
+    (old, _), (metrics, out) = auto, again
     assert metrics["map"]["found_t_s"] is not None
     assert metrics["up"]["source"] == "map"
-    np.testing.assert_array_equal(metrics["up"]["direction"], old["up"]["direction"])
-    assert lean_deg(tmp_path / "run") < 2.0
+    np.testing.assert_array_equal(metrics["up"]["direction"], [0.0, 0.0, 1.0])  # its own frame is level
+    np.testing.assert_array_equal(metrics["up"]["R_map_odom"], np.eye(3))
+    ups = [np.array(m["up"]["direction_cam0"]) for m in (old, metrics)]  # both begin with the same image
+    assert angle_deg(*ups) < 1.0
+    assert lean_deg(out) < 2.0
+
+
+def test_files_session_and_published_pose_of_a_run_in_a_map_are_in_one_level_frame(auto, again):
+    old, new = auto[1], again[1]
+    assert lean_deg(new, "live") < 2.0
+    paths = {out: [read_tum(out / f"trajectory_{name}.tum") for name in ("live", "graph")] for out in (old, new)}
+    live, built = paths[new]
+    for other in (built, paths[old][1]):  # the same recording: the old run's files say where it was, too
+        apart = [invert(a) @ b for a, b in zip(live.T_world_body, other.at(live.t_ns), strict=True)]
+        assert max(np.linalg.norm(T[:3, 3]) for T in apart) < 0.05
+        assert max(angle_deg(T[:3, 2], np.array([0.0, 0.0, 1.0])) for T in apart) < 1.0
+    count, T_level_map = len(stored(old)[0]), stored(old)[1].T_level_map
+    assert angle_deg(T_level_map[:3, 2], np.array([0.0, 0.0, 1.0])) > 5.0
+    turned = T_level_map @ stored(old)[0]
+    np.testing.assert_allclose(stored(new)[0][:count, 1], turned[:, 1], atol=1e-12)
+    assert np.abs(stored(new)[0][:count, 0] - turned[:, 0]).max() < 0.05  # loops move the map a little
+    np.testing.assert_array_equal(stored(new)[1].direction, [0.0, 0.0, 1.0])
+    grids = [(out / "map" / "grid.yaml").read_text() for out in (old, new)]
+    assert [line.split(":")[0] for line in grids[0].splitlines()] == [
+        line.split(":")[0] for line in grids[1].splitlines()
+    ]
+
+
+def test_a_run_in_a_map_that_is_turned_replays_to_the_same_bytes(auto, again, source, tmp_path):
+    run_in_map(open_source(source, 0), auto[1], tmp_path / "run")
+    names = (
+        "trajectory_live.tum",
+        "trajectory_graph.tum",
+        "loops.csv",
+        "tracking.csv",
+        "map/octomap.bt",
+        "map/grid.pgm",
+    )
+    for name in names:
+        assert (tmp_path / "run" / name).read_bytes() == (again[1] / name).read_bytes(), name
+
+
+def as_written_before(out, T_level_map, up):
+    """Make of a run in a map what version 0.1 left: in the axes of the first run's first image, `up` beside it."""
+    with editing(out / "session.db") as db:
+        for k, *blobs in db.execute("SELECT id, T_map_body, T_odom_body FROM keyframes").fetchall():
+            T = [(invert(T_level_map) @ np.frombuffer(blob, "<f8").reshape(4, 4)).tobytes() for blob in blobs]
+            db.execute("UPDATE keyframes SET T_map_body = ?, T_odom_body = ? WHERE id = ?", (*T, k))
+        base = json.loads(db.execute("SELECT value FROM info WHERE key = 'map'").fetchone()[0])
+        for key, value in (("map", {**base, "up": up.entry()}), ("up", replace(up, source="map").entry())):
+            db.execute("UPDATE info SET value = ? WHERE key = ?", (json.dumps(value), key))
+
+
+def test_a_session_of_the_version_before_is_turned_when_a_run_begins_in_it(auto, again, source, tmp_path):
+    before = tmp_path / "before"
+    shutil.copytree(again[1], before)
+    up = stored(auto[1])[1]
+    as_written_before(before, up.T_level_map, up)
+    np.testing.assert_array_equal(stored(before)[1].direction, up.direction)
+    runs = [tmp_path / "one", tmp_path / "other"]
+    for base, out in zip((again[1], before), runs, strict=True):
+        assert run_in_map(open_source(source, 0), base, out)["map"]["found_t_s"] is not None
+        assert max(lean_deg(out, name) for name in ("live", "graph")) < 2.0
+    one, other = (stored(out) for out in runs)
+    np.testing.assert_allclose(one[0], other[0], atol=1e-6)
+    np.testing.assert_array_equal(one[1].direction, other[1].direction)
+
+
+def test_a_map_stays_level_where_a_run_is_not_found_in_it_or_told_otherwise(auto, source, tmp_path):
+    elsewhere = open_world("handheld-room", duration_s=2.0, camera_hz=5.0, image_width_px=320, world_seed=3)
+    metrics = run_in_map(elsewhere, auto[1], tmp_path / "elsewhere")
+    assert metrics["map"]["found_t_s"] is None
+    assert metrics["up"]["source"] == "unknown"  # of its own frame: the surfaces that it saw are in no map
+    poses, up = stored(tmp_path / "elsewhere")
+    np.testing.assert_array_equal(up.direction, [0.0, 0.0, 1.0])
+    old = stored(auto[1])
+    np.testing.assert_allclose(poses[: len(old[0]), 1], old[1].T_level_map @ old[0][:, 1], atol=1e-12)
+    assert (tmp_path / "elsewhere" / "map" / "grid.pgm").is_file()
+    metrics = run_in_map(open_source(source, 0), auto[1], tmp_path / "told", "camera")
+    assert metrics["up"]["source"] == "map"
+    assert "--up camera is not used" in metrics["up"]["reason"]
 
 
 def test_what_is_optimized_later_stands_upright_too(auto, tmp_path):

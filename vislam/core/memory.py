@@ -266,6 +266,17 @@ class SlamMemory:
     map_keyframes: int = 0  # number of first keyframes that are of earlier runs
     T_guess: Array | None = None  # [4, 4] where the body is assumed to be in that map when a recording begins; None
 
+    def turned(self, T: Array) -> SlamMemory:
+        """Return the memory of a run without gravity with `map` and `odom` both moved by T [4, 4]."""
+        T_map_body = T @ self.graph.T_map_body
+        return replace(
+            self,
+            front=replace(self.front, T_odom_body=T @ self.front.T_odom_body),
+            T_start=T @ self.T_start,
+            graph=replace(self.graph, T_map_body=T_map_body, T_odom_body=T @ self.graph.T_odom_body),
+            places=replace(self.places, T_map_body=T_map_body),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameEntry:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -45,6 +45,11 @@ class Up:
     def T_level_map(self) -> Array:
         """The rotation [4, 4] about the origin that turns up onto +z and nothing besides; identity where unknown."""
         return np.eye(4) if self.direction is None else transform(turn_to_z(self.direction), np.zeros(3))
+
+    @property
+    def levelled(self) -> Up:
+        """The same in the frame that T_level_map leads to, where up is +z."""
+        return self if self.direction is None else replace(self, direction=np.array([0.0, 0.0, 1.0]))
 
     @classmethod
     def unknown(cls, reason: str) -> Up:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vislam.config import Config, recorded
 from vislam.core.errors import DataError, UsageError
-from vislam.core.geometry import invert, rotation_from_quaternion_xyzw, transform
+from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
 from vislam.core.recording import Recording
@@ -23,7 +23,7 @@ from vislam.mapping.semantic.images import LabelFolder
 from vislam.pipeline.settings import derived
 from vislam.runs.drive import Progress, Run, imu_noise
 from vislam.runs.folder import MapChoice, storage, write_setup
-from vislam.runs.levelled import stored_level
+from vislam.runs.levelled import stored_up
 from vislam.runs.session import Session, SessionWriter, has_begun, recall
 
 _FARTHEST_M = 1e5  # of a pose that a user gives
@@ -108,7 +108,8 @@ def begun(
     try:
         memory = map_of(stored, recording, config, noise, base.localize_only)
         write_setup(out, config, source, command, base)
-        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only, bool(memory.scans))
+        up = stored_up(stored.info())
+        session = SessionWriter.in_map(path, stored, info, noise, base.localize_only, bool(memory.scans), up)
     finally:
         stored.close()
     run = make(session)
@@ -136,16 +137,18 @@ def map_of(
 ) -> SlamMemory:
     """Return the map of a session; raises UsageError when a recording cannot go on in it, DataError without one.
 
-    With `is_held` it is not to change.
+    With `is_held` it is not to change. It is level, if up was found in it: a session of a run without gravity is not.
     """
     check_fits(stored, recording, config, noise)
-    memory = recall(stored)
+    memory, up = recall(stored), stored_up(stored.info())
     if memory is None:
         raise DataError(f"{stored.path} holds no map: not one keyframe, or gravity was not found")
+    if up is not None:
+        memory = memory.turned(up.T_level_map)
     if config.loop.start_in_map is not None and not recording.rig.has_depth:
         raise UsageError(f"--loop.start-in-map is a guess for depth, which {recording.name} does not have")
     count = len(memory.graph.packets)
-    T_guess = parse_start(config.loop.start_in_map, stored_level(stored.info()).T_level_map)
+    T_guess = parse_start(config.loop.start_in_map)
     memory = replace(memory, held=count if is_held else 0, map_keyframes=count, T_guess=T_guess)
     was = recorded(stored.info().get("config") or {}, str(stored.path)).get("map") or {}
     now = json.loads(json.dumps(asdict(config.map)))
@@ -154,24 +157,20 @@ def map_of(
     return memory
 
 
-def parse_start(text: str | None, T_level_map: Array) -> Array | None:
-    """Return the pose [4, 4] that `loop.start_in_map` gives in a map's files, in the frame of its session.
-
-    `T_level_map` [4, 4] turns one into the other. Raises UsageError when it is no pose.
-    """
+def parse_start(text: str | None) -> Array | None:
+    """Return the pose [4, 4] that `loop.start_in_map` gives in a map. Raises UsageError when it is no pose."""
     if text is None:
         return None
     try:
         values = np.array([float(part) for part in text.split(",")])
         if values.shape != (7,) or not np.isfinite(values).all() or np.abs(values[:3]).max() > _FARTHEST_M:
             raise ValueError
-        T = transform(rotation_from_quaternion_xyzw(values[3:]), values[:3])
+        return transform(rotation_from_quaternion_xyzw(values[3:]), values[:3])
     except ValueError:
         raise UsageError(
             f"--loop.start-in-map {text}: give X,Y,Z in metres and QX,QY,QZ,QW of the body in the map, as a line of "
             "its trajectory_graph.tum has them after the stamp"
         ) from None
-    return np.asarray(invert(T_level_map) @ T)
 
 
 def check_fits(stored: Session, recording: Recording, config: Config, noise: ImuNoise | None) -> None:

@@ -245,14 +245,14 @@ class Run:
         final, rows, loops = self._write_estimates()
         self._explain([] if is_brief else rows)
         truth = self._truth()
-        of_map = None if self.base is None or self.joined_t_ns is None else self.base.get("up")
-        level = find_up(self.recording, self.config, Known(final, mapper, self.slam.front, of_map))
+        known = Known(final, mapper, self.slam.front, self.base, self.joined_t_ns is not None)
+        level = find_up(self.recording, self.config, known)
         self.warnings += level.warnings
         level_path = level.trajectory(final)
         self.log.write_trajectories(self.out, level_path, truth)
         if mapper is not None:
             with self.slam.clock.measure("map export"):
-                level_map = level.export(mapper, self.out / "map")
+                level_map = level.in_map.export(mapper, self.out / "map")
             self.warnings += [f"no {name}: {reason}" for name, reason in level_map.notes.items()]
         if self.slam.back is not None:
             self.warnings += label_warnings(self.slam.back.counters.get("map", {}))
@@ -264,10 +264,10 @@ class Run:
         wall_s = time.perf_counter() - start  # everything but pictures and report
         if mapper is not None:
             with self.slam.clock.measure("pictures"):
-                write_pictures(level_map, self.out / "map", level_path.positions_m, level.is_level)
+                write_pictures(level_map, self.out / "map", level_path.positions_m, level.in_map.is_level)
         metrics = self._metrics(level_path, truth, wall_s, loops)
         if up := level.entry(final, self.recording.rig):
-            self.session.set_info(up)
+            self.session.set_info({} if level.of_map else up)
             metrics |= up
         estimates = {"filter": self.log.odometry_trajectory(), "graph": final}
         if (datum := self._geodetic.write(self.out, metrics["sensors"], estimates)) is not None:

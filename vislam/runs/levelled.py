@@ -1,7 +1,8 @@
 """Which way is up in a finished run without gravity, and what is final of it turned so that z of `map` is up.
 
 What was published while the run went on (`odom`, the causal trajectories, the viewer's recording) and the session stay
-in the axes of the first image; decision 10 has the reason.
+in the axes of the first image; decision 10 has the reason. A run that begins in the map of another has it level from
+the beginning on.
 """
 
 from __future__ import annotations
@@ -42,10 +43,17 @@ class Levelled:
     Attributes:
         up: None where gravity is known.
         asked: what each source gives that was asked; surfaces are the last.
+        of_map: up of the map in which a run began that was not found in it, so that `up` is of its own frame alone.
     """
 
     up: Up | None = None
     asked: tuple[Up, ...] = ()
+    of_map: Up | None = None
+
+    @property
+    def in_map(self) -> Levelled:
+        """The same of the map and its files."""
+        return self if self.of_map is None else Levelled(self.of_map)
 
     @property
     def is_level(self) -> bool:
@@ -134,33 +142,44 @@ class Known:
         path: the final trajectory, in the frame in which it was estimated.
         mapper: None where there is no map to ask.
         front: what started, and how a camera over a floor looks at it.
-        of_map: what the map in which the run began said, if the run was found in it.
+        base: the map in which the run began, as its session has it; None where it began in none.
+        is_found: whether it was found in it.
     """
 
     path: Trajectory
     mapper: Mapper | None
     front: FrontHalf
-    of_map: dict[str, Any] | None = None
+    base: dict[str, Any] | None = None
+    is_found: bool = False
 
 
 def find_up(recording: Recording, config: Config, known: Known) -> Levelled:
-    """Return which way is up, without gravity: as given, by the map, the accelerometer, the floor, or surfaces."""
-    asked = parse_up(config.up)
+    """Return which way is up, without gravity: by the map, as given, the accelerometer, the floor, or surfaces.
+
+    The map comes first: its frame is that of the files, the session and what was published.
+    """
     if known.front.start is not None or not len(known.path):
         return Levelled()
-    if not isinstance(asked, str):
-        up = known.path.T_world_body[0, :3, :3] @ recording.rig.T_body_cams[0][:3, :3] @ asked
+    of_map = stored_up(known.base or {})
+    if known.base is not None and not known.is_found:
+        own = _by_itself(recording, config, replace(known, mapper=None))  # whose surfaces are the map's
+        return replace(own, of_map=of_map or Up.unknown("the run was not found in it"))
+    if of_map is None:
+        return _by_itself(recording, config, known)
+    unused = "" if config.up == "auto" else f"; --up {config.up} is not used where the map knows it"
+    return Levelled(replace(of_map, source="map", reason=of_map.reason + unused))
+
+
+def _by_itself(recording: Recording, config: Config, known: Known) -> Levelled:
+    """Return which way is up as given, or by what was measured."""
+    given = parse_up(config.up)
+    if not isinstance(given, str):
+        up = known.path.T_world_body[0, :3, :3] @ recording.rig.T_body_cams[0][:3, :3] @ given
         return Levelled(Up("told", up / np.linalg.norm(up), None, 1.0, f"--up {config.up}"))
-    if asked == "none":
+    if given == "none":
         return Levelled(Up.unknown("--up none"))
-    if asked == "camera":
+    if given == "camera":
         return Levelled(Up("camera", np.array([0.0, 0.0, 1.0]), None, 1.0, "--up camera: as the first image has it"))
-    of_map = stored_up({"up": known.of_map})
-    return _found(recording, known) if of_map is None else Levelled(replace(of_map, source="map"))
-
-
-def _found(recording: Recording, known: Known) -> Levelled:
-    """Return which way is up by what was measured."""
     planes = Up.unknown("there is no map to look at") if known.mapper is None else surest_up(known.mapper.views)
     others = [_by_forces(recording, known.path), _by_floor(known, recording.rig)]
     asked = (*(up for up in others if up is not None), planes)
@@ -215,15 +234,13 @@ def onto_map(path: Trajectory, name: str, metrics: dict[str, Any]) -> Trajectory
 
 
 def stored_up(info: dict[str, Any]) -> Up | None:
-    """Return what a session or a map remembers of up; None where it is not known. Raises DataError on nonsense."""
-    entry = info.get("up")
-    if entry is None:
-        return None
+    """Return what a session remembers of up in its map; None where it is not known. Raises DataError on nonsense."""
+    of_map = (info.get("map") or {}).get("up")  # in which it began, and was found or not
     try:
-        up = Up.from_entry(entry)
+        ups = [Up.from_entry(entry) for entry in (of_map, info.get("up")) if entry is not None]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"what is stored of up cannot be used ({error}); run the recording again") from error
-    return up if up.is_known else None
+    return next((up for up in ups if up.is_known), None)
 
 
 def stored_level(info: dict[str, Any]) -> Levelled:

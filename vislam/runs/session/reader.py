@@ -117,11 +117,6 @@ class Session:
             rows = self._db.execute("SELECT key, value FROM info").fetchall()
             return {key: json.loads(value) for key, value in rows}
 
-    def up(self) -> dict[str, Any]:
-        """Return which way is up as `{"up": ...}` where gravity was not known; empty elsewhere."""
-        info = self.info()
-        return {"up": info["up"]} if info.get("up") else {}
-
     def config(self) -> Config:
         """Return the settings of the run; raises DataError when they are damaged, or of another version."""
         try:

@@ -24,7 +24,8 @@ from vislam.core.memory import (
     StartFacts,
     TagSighting,
 )
-from vislam.core.messages import GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
+from vislam.core.messages import Array, GraphUpdate, LoopCandidate, LoopDecision, LoopEdge, NavState
+from vislam.core.up import Up
 from vislam.factors import rig_data, state_data
 from vislam.imu import ImuNoise
 from vislam.runs.session.checks import check_records, check_sound, checksum, checksums, has_labels, has_readings
@@ -37,6 +38,7 @@ from vislam.runs.session.schema import (
     READINGS_SCHEMA,
     SCHEMA_VERSION,
     maybe_bytes,
+    numbers,
     readable,
     schema,
     state_bytes,
@@ -102,11 +104,12 @@ class SessionWriter:
     @classmethod
     def in_map(
         cls, path: Path, base: Session, info: dict[str, Any], noise: ImuNoise | None, localize_only: bool,
-        with_scans: bool,
+        with_scans: bool, up: Up | None,
     ) -> SessionWriter:  # fmt: skip
         """Create the file of a run that begins in the map of another session, of which it holds a copy.
 
         Without `with_scans` it holds no clouds of it: those of another shape could not be read with its own settings.
+        `up` is that of the map, if it was made without gravity: the copy is turned so that it is +z.
         Raises StorageError when it cannot be written.
         """
         part = path.with_name(path.name + ".part")  # the file appears whole or not at all
@@ -122,7 +125,10 @@ class SessionWriter:
                 db.execute("DELETE FROM states WHERE whose = 'filter'")
                 db.execute("DELETE FROM info WHERE key NOT IN ('rig', 'first_state', 'gravity_m_s2', 'labels')")
                 count = db.execute("SELECT COUNT(*) FROM keyframes").fetchone()[0]
-                origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only, **base.up()}
+                origin = {"path": str(base.path), "keyframes": count, "localize_only": localize_only}
+                if up is not None:
+                    writer._turn(up.T_level_map)
+                    origin["up"] = up.levelled.entry()
                 sensors = {"imu_noise": None if noise is None else asdict(noise)}
                 writer._set_info({**info, **sensors, "map": origin, "finished": False})
             db.close()
@@ -155,6 +161,13 @@ class SessionWriter:
             for statement in lacking.split(";"):
                 self._db.execute(statement)
             self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+    def _turn(self, T: Array) -> None:
+        """Move `map` and `odom` of all keyframes by T [4, 4]; without gravity nothing else is stored in their axes."""
+        for (k,) in self._db.execute("SELECT id FROM keyframes").fetchall():
+            row = self._db.execute("SELECT * FROM keyframes WHERE id = ?", (k,)).fetchone()
+            poses = (to_bytes(T @ numbers(blob, "<f8", (4, 4)), "<f8") for blob in row[2:4])
+            self._replace("keyframes", [(*row[:2], *poses, *row[4:7])])
 
     def base(self) -> dict[str, Any] | None:
         """Return the map in which the run began, if it did: its path, its number of keyframes, whether it is held."""
