@@ -5,7 +5,7 @@
 
 A recording is split in time: seconds 0 to `--split` make the map, the rest (up to `--until`) is run in it, with images
 made black from `--dark-after` seconds after it was found there. Errors are of causal poses in the map's frame, which is
-laid on the truth by the map's keyframes: rms over the dark frames, and at the end. `edges` are loops by depth into the
+laid on the truth by the first run: rms over the dark frames, and at the end. `edges` are loops by depth into the
 map that the graph believes at the end, of those that were offered; `off` is by how much all offered differ from the
 truth (median, worst), `false` those by more than 10 cm or 5 deg, `NEES` the mean of e' P^-1 e, six when the covariance
 is right. With `--start` all images are negatives, which odometry follows and no image of the map is like, and a pose is
@@ -41,7 +41,7 @@ from vislam.runs import execute, imu_noise, map_of  # noqa: E402
 from vislam.runs.session import Session  # noqa: E402
 from vislam.runs.sources import open_source  # noqa: E402
 from vislam.slam import Slam  # noqa: E402
-from vislam.trajectory import Trajectory  # noqa: E402
+from vislam.trajectory import Trajectory, read_tum  # noqa: E402
 
 SOURCES = ("sim:handheld-room,camera_hz=15,image_width_px=480",)
 BLACK = 8  # grey level
@@ -77,11 +77,11 @@ def negative(frame: Frame) -> Frame:
     return replace(frame, images=tuple(255 - image for image in frame.images), color=color)
 
 
-def truth_in_map(session: Session, truth: Trajectory) -> Array:
-    """Return T_map_truth [4, 4], by the positions of the map's keyframes."""
-    stored = list(session.keyframes())
-    T = truth.at(np.array([k.t_ns for k in stored]))
-    return align_points(T[:, :3, 3], np.array([k.T_map_body[:3, 3] for k in stored]))
+def truth_in_map(old: Path, truth: Trajectory) -> Array:
+    """Return T_map_truth [4, 4], by the final positions of the run that made the map."""
+    path = read_tum(old / "trajectory_graph.tum")
+    inside = (path.t_ns >= truth.t_ns[0]) & (path.t_ns <= truth.t_ns[-1])
+    return align_points(truth.at(path.t_ns[inside])[:, :3, 3], path.positions_m[inside])
 
 
 @dataclass
@@ -108,7 +108,7 @@ def run(old: Path, part: Part, settings: Config, noise: ImuNoise | None, dark_af
     truth, config = part.truth(), derived(settings, part.rig, noise)
     assert truth is not None
     session = Session(old / "session.db")
-    T_map_truth = truth_in_map(session, truth)
+    T_map_truth = truth_in_map(old, truth)
     memory = map_of(session, part, config, noise)
     seen = Seen(stamps={k.id: k.t_ns for k in session.keyframes()})
     session.close()
@@ -198,12 +198,11 @@ def main() -> None:
 
 def start(old: Path, part: Part, off_m: float, off_deg: float) -> str:
     """Return the true pose at the begin of a stretch, so far off, as `--loop.start-in-map` takes it."""
-    truth, session = part.truth(), Session(old / "session.db")
+    truth = part.truth()
     assert truth is not None
     first = next(value.t_ns for value in part.events() if isinstance(value, Frame))
     off = se3_exp(np.array([0.0, np.deg2rad(off_deg), 0.0, 0.7 * off_m, 0.0, -0.7 * off_m]))
-    T = truth_in_map(session, truth) @ truth.at(np.array([first]))[0] @ off
-    session.close()
+    T = truth_in_map(old, truth) @ truth.at(np.array([first]))[0] @ off
     return ",".join(f"{x:.9f}" for x in [*T[:3, 3], *quaternion_xyzw_from_rotation(T[:3, :3])])
 
 
