@@ -18,8 +18,8 @@ from vislam.core.geometry import invert
 from vislam.core.up import Up, parse_up, turn_to_z
 from vislam.datasets import open_dataset
 from vislam.datasets.recorder import record
-from vislam.runs import execute
-from vislam.runs.folder import MapChoice, prepare
+from vislam.runs import execute, resume
+from vislam.runs.folder import MapChoice, prepare, read_setup
 from vislam.runs.levelled import onto_map, stored_up, with_planes
 from vislam.runs.offline.rebuild import map_settings, rebuild
 from vislam.runs.report import write_report
@@ -311,6 +311,24 @@ def test_a_session_of_the_version_before_is_turned_when_a_run_begins_in_it(auto,
     one, other = (stored(out) for out in runs)
     np.testing.assert_allclose(one[0], other[0], atol=1e-6)
     np.testing.assert_array_equal(one[1].direction, other[1].direction)
+
+
+def test_a_run_in_a_level_map_that_was_ended_goes_on_in_its_frame(auto, source, tmp_path):
+    def stop(done, total, note):
+        if done == 12:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    prepare(out, False)
+    with pytest.raises(KeyboardInterrupt):
+        execute(open_source(source, 0), CONFIG, out, "again", ["test"], stop, MapChoice(auto[1], False))
+    _, config, base = read_setup(out)
+    metrics = resume(open_source(source, 0), config, out, "again", ["test"], None, base)
+    assert len(metrics["resumed"]) == 1
+    assert metrics["up"]["source"] == "map"
+    assert max(lean_deg(out, name) for name in ("live", "graph")) < 2.0
+    live, built = (read_tum(out / f"trajectory_{name}.tum") for name in ("live", "graph"))
+    assert np.linalg.norm(live.positions_m - built.at(live.t_ns)[:, :3, 3], axis=1).max() < 0.05
 
 
 def test_a_map_stays_level_where_a_run_is_not_found_in_it_or_told_otherwise(auto, source, tmp_path):
