@@ -336,6 +336,8 @@ def test_a_map_stays_level_where_a_run_is_not_found_in_it_or_told_otherwise(auto
     metrics = run_in_map(elsewhere, auto[1], tmp_path / "elsewhere")
     assert metrics["map"]["found_t_s"] is None
     assert metrics["up"]["source"] == "unknown"  # of its own frame: the surfaces that it saw are in no map
+    with editing(tmp_path / "elsewhere" / "session.db") as db:  # as version 0.1 stored it: of that frame, too
+        db.execute("INSERT INTO info VALUES ('up', ?, 0)", (json.dumps(said("floor", 30.0, 1.0).entry()),))
     poses, up = stored(tmp_path / "elsewhere")
     np.testing.assert_array_equal(up.direction, [0.0, 0.0, 1.0])
     old = stored(auto[1])
