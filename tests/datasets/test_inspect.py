@@ -10,8 +10,9 @@ from test_other_formats import write_kitti, write_tum, write_video
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import so3_exp, so3_log
+from vislam.datasets.camera_turns import fit_turns, follow_turns
 from vislam.datasets.inspect import Inspection, inspect
-from vislam.datasets.plausibility import epipolar_facts, gyro_turns, turn_disagreement
+from vislam.datasets.plausibility import epipolar_facts
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
 
 
@@ -155,18 +156,23 @@ def turned_view(R_world_cam: np.ndarray, scale: float = 1.0) -> np.ndarray:
 def test_turn_seen_by_camera_and_gyro() -> None:
     R_body_cam = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     rate = np.array([0.2, -0.5, 0.6])
-    images = [turned_view(R_body_cam.T @ so3_exp(rate * t) @ R_body_cam) for t in (0.0, 0.05, 0.1, 0.15)]
-    rows = [(i * 10_000_000, [*rate, 0.0, 0.0, 9.81]) for i in range(30)]
-    (turn,) = gyro_turns(rows, [(5_000_000, 155_000_000)], np.zeros(3))
-    assert turn is not None
-    np.testing.assert_allclose(turn, so3_exp(rate * 0.15), atol=1e-9)
-    right = turn_disagreement(CAMERA, R_body_cam, images, turn)
-    wrong = turn_disagreement(CAMERA, R_body_cam.T, images, turn)
-    assert right is not None and right < 0.1
+    rows = [(i * 10_000_000, [*rate, 0.0, 0.0, 9.81]) for i in range(120)]
+    t_ns = np.arange(5_000_000, 1_000_000_000, 50_000_000)
+    images = [turned_view(R_body_cam.T @ so3_exp(rate * (i % 4) * 0.05) @ R_body_cam) for i in range(20)]
+    places = [[range(first, first + 4)] for first in range(0, 20, 4)]  # each turns by the same 0.15 s
+    tracks = follow_turns(places, t_ns, lambda frame: [images[frame]])
+    right = fit_turns(CAMERA, R_body_cam, tracks, rows, np.zeros(3))
+    wrong = fit_turns(CAMERA, R_body_cam.T, tracks, rows, np.zeros(3))
+    assert right is not None and right.places == 5 and right.differ < 0.1
+    turn = so3_exp(rate * 0.15)
     expected = np.linalg.norm(so3_log(R_body_cam @ turn.T @ R_body_cam.T @ R_body_cam.T @ turn @ R_body_cam))
-    assert wrong == pytest.approx(expected / np.linalg.norm(rate * 0.15), abs=0.1) and wrong > 0.5
-    assert turn_disagreement(CAMERA, R_body_cam, [images[0]] * 4, np.eye(3)) is None
-    assert gyro_turns(rows[:5], [(5_000_000, 155_000_000)], np.zeros(3)) == [None]
+    assert wrong is not None and wrong.differ > 0.5
+    assert wrong.differ == pytest.approx(expected / np.linalg.norm(rate * 0.15), abs=0.1)
+    at_rest = [(t, [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) for t, _ in rows]
+    still = follow_turns(places, t_ns, lambda _: [images[0]])
+    assert len(still) == 5 and fit_turns(CAMERA, R_body_cam, still, at_rest, np.zeros(3)) is None
+    assert fit_turns(CAMERA, R_body_cam, tracks, rows[:5], np.zeros(3)) is None  # too thin
+    assert follow_turns(places, t_ns, lambda frame: [images[frame]] if frame % 4 else []) == []  # lost images
 
 
 def test_epipolar_check_tells_right_wrong_and_swapped() -> None:

@@ -6,21 +6,19 @@ They return numbers; `inspect.py` judges them.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.angles import angle_between
-from vislam.core.camera import Camera, Rig
-from vislam.core.geometry import invert, skew, so3_exp, so3_log
+from vislam.core.camera import Rig
+from vislam.core.geometry import invert, skew
 from vislam.core.messages import Array, ImageU8
 from vislam.datasets.tables import Row
 from vislam.imu.rest import is_still
-from vislam.vision.two_view import essential_ransac
 
 Stamps = NDArray[np.int64]
 
@@ -119,78 +117,6 @@ def camera_tilt_rad(facts: ImuFacts, rig: Rig) -> float:
     chosen = facts.accel_mean[facts.at_rest] if facts.at_rest.any() else facts.accel_mean
     up_cam = rig.T_body_cams[0][:3, :3].T @ chosen.mean(axis=0)
     return angle_between(up_cam, np.array([0.0, -1.0, 0.0]))
-
-
-def turning_pairs(facts: ImuFacts, frame_t_ns: Stamps, count: int) -> list[tuple[int, int]]:
-    """Return up to `count` pairs of frames some 0.2 s apart, from the windows in which the body turns most."""
-    rate = np.linalg.norm(facts.gyro_mean - facts.gyro_bias_rad_s, axis=1)
-    pairs = []
-    for window in np.argsort(-rate, kind="stable"):
-        begin_ns = int(facts.window_t_ns[window])
-        first = int(np.searchsorted(frame_t_ns, begin_ns))
-        last = int(np.searchsorted(frame_t_ns, begin_ns + _TURN_SPAN_NS, side="right")) - 1
-        if last > first:
-            pairs.append((first, last))
-        if len(pairs) == count:
-            break
-    return sorted(pairs)
-
-
-def gyro_turns(
-    rows: Iterable[Row[list[float]]], spans_ns: Sequence[tuple[int, int]], bias_rad_s: Array
-) -> list[Array | None]:
-    """Return R_begin_end [3, 3] of the body over each span, integrated from inertial rows; None where they are thin."""
-    turns = [np.eye(3) for _ in spans_ns]
-    covered = [0 for _ in spans_ns]
-    previous: tuple[int, Array] | None = None
-    for t_ns, values in rows:
-        rate = np.array(values[:3]) - bias_rad_s
-        if previous is not None:
-            mean = 0.5 * (rate + previous[1])
-            for i, (begin_ns, end_ns) in enumerate(spans_ns):
-                part_ns = min(t_ns, end_ns) - max(previous[0], begin_ns)
-                if part_ns > 0 and t_ns - previous[0] < _WINDOW_NS:
-                    turns[i] = turns[i] @ so3_exp(mean * (part_ns * 1e-9))
-                    covered[i] += part_ns
-        previous = (t_ns, rate)
-    return [
-        turn if covered[i] > 0.99 * (end - begin) else None
-        for i, (turn, (begin, end)) in enumerate(zip(turns, spans_ns, strict=True))
-    ]
-
-
-def turn_disagreement(camera: Camera, R_body_cam: Array, images: Sequence[ImageU8], R_begin_end: Array) -> float | None:
-    """Return how far the turn seen in images of one span is from the gyro's, as a fraction of the turn.
-
-    About 0 when `R_body_cam` and the time stamps are right, about 1 or more when not; None when the body turns too
-    little or the images track too badly. The turn of the images is that of their essential matrix (Nister, 2004).
-    """
-    R_gyro = R_body_cam.T @ R_begin_end @ R_body_cam
-    angle = float(np.linalg.norm(so3_log(R_gyro)))
-    tracks = _track(images)
-    if angle < _MIN_TURN_RAD or tracks is None:
-        return None
-    first, last = camera.normalise(tracks[0]), camera.normalise(tracks[1])
-    usable = np.all(np.isfinite(np.hstack([first, last])), axis=1)
-    if int(usable.sum()) < _MIN_TRACKS:
-        return None
-    # of the two rotations of an essential matrix the one nearer to none: a turn on the spot has no depths to decide by
-    found = essential_ransac(np.eye(3), first[usable], last[usable], _INLIER_PX / camera.fx, 0)
-    return None if found is None else float(np.linalg.norm(so3_log(R_gyro.T @ found[0]))) / angle
-
-
-def _track(images: Sequence[ImageU8]) -> tuple[Array, Array] | None:
-    """Return pixels [N, 2] in the first and the last of consecutive images, followed by Lucas-Kanade."""
-    start = cv2.goodFeaturesToTrack(images[0], _CORNERS, 0.01, 12.0)
-    if start is None or len(start) < _MIN_TRACKS:
-        return None
-    points, kept = start, np.ones(len(start), dtype=bool)
-    for before, after in pairwise(images):
-        points, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(21, 21), maxLevel=4)
-        kept &= status.ravel() == 1
-    if int(kept.sum()) < _MIN_TRACKS:
-        return None
-    return start[kept].reshape(-1, 2).astype(np.float64), points[kept].reshape(-1, 2).astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
