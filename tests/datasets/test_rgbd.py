@@ -19,8 +19,15 @@ from vislam.datasets import open_dataset, survey
 from vislam.datasets.calibration import DepthFile, parse_depth
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.inspect import inspect
-from vislam.datasets.rgbd import RgbdFacts, rgbd_faults
+from vislam.datasets.recorder import record
+from vislam.datasets.rgbd import RgbdFacts, rgbd_facts, rgbd_faults
 from vislam.datasets.rgbd.facts import OddValue, odd_values
+from vislam.datasets.stream import frame_table
+from vislam.datasets.tables import Problems
+from vislam.sim import open_world
+from vislam.sim.motion.path import wander
+from vislam.sim.motion.spline import BodySpline
+from vislam.sim.worlds.table import WORLDS
 from vislam.vision.depth_edges import EdgeAlignment, FrameEnds, align_edges, frame_ends
 from vislam.vision.depth_focal import FocalFit, SeenPoints, fit_focal
 from worlds.mini_recording import camera_yaml
@@ -219,3 +226,37 @@ def test_doctor_tells_of_saturated_depth_and_of_what_it_cannot_tell(tmp_path: Pa
     said = {finding.what: finding.severity for finding in inspect(str(folder)).findings}
     assert said["depth 65535 in 20.8% of the pixels means that nothing was measured"] == "warning"
     assert any(what.startswith("colour and depth do not show offset or lag or focal length") for what in said)
+
+
+def hand_with_fast_turns(rng: np.random.Generator) -> BodySpline:
+    """Turns of up to some 140 deg/s, as of a hand, in the middle of a room."""
+    seeds = rng.integers(0, 2**32, 3)
+
+    def design(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        sway, swing, tremble = (np.random.default_rng(seed) for seed in seeds)
+        position = np.array([0.0, 0.0, 1.35]) + wander(t_s, sway, 0.12, (0.2, 0.8), 3)
+        angles = np.column_stack([0.0 * t_s, 0.0 * t_s + 0.12, 0.35 * t_s])
+        angles += wander(t_s, swing, 1.0, (0.3, 1.0), 3) * np.array([0.1, 0.14, 0.28])
+        return position, angles + wander(t_s, tremble, 0.006, (1.5, 4.0), 3)
+
+    return BodySpline.from_design(design, 8.0, 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "readout_s"), [(1, 0.03), (2, 0.02)])
+def test_fast_turns_with_a_rolling_shutter_do_not_bias_the_focal_length(
+    seed: int, readout_s: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(WORLDS, "handheld-room", replace(WORLDS["handheld-room"], motion=hand_with_fast_turns))
+    options = {"rig": "rgbd", "camera_hz": 30.0, "image_width_px": 320, "readout_s": readout_s, "world_seed": seed}
+    record(open_world("handheld-room", seed, workers=2, **options), tmp_path)
+    found = survey(str(tmp_path))
+    frames, rig = frame_table(found, Problems()), found.rig
+    assert rig is not None
+    for off in (1.0, 1.05):
+        camera = replace(rig.cameras[0], fx=off * rig.cameras[0].fx, fy=off * rig.cameras[0].fy)
+        measured = rgbd_facts(found, replace(rig, cameras=(camera,)), frames)
+        focal = measured.focal
+        assert focal is not None and focal.readout_s == pytest.approx(off * readout_s, abs=1e-3)  # as pixels per angle
+        assert abs(off * focal.factor - 1.0) < min(3.0 * focal.sigma, 0.01)
+        assert [fault.what for fault in rgbd_faults(measured, 320)] == ([] if off == 1.0 else ["focal length"])

@@ -54,7 +54,7 @@ class _Key:
     count: int
     begin: Array
     now: Array
-    speed: Array | None = None
+    speeds: list[Array] = field(default_factory=list)  # of the first two steps and the last two
 
 
 @dataclass(slots=True, eq=False)
@@ -106,17 +106,23 @@ class _Block:
             part = slice(at, at + len(key.now))
             at += len(key.now)
             seen = np.isfinite(there[part]).all(axis=1)
-            key.speed = (speed[part] if key.speed is None else key.speed)[seen]
+            steps = [*key.speeds, speed[part]]
+            key.speeds = [one[seen] for one in (steps[:2] + steps[-2:] if len(steps) > 4 else steps)]
             key.begin, key.now = key.begin[seen], there[part][seen]
             long = (frame - key.frame) * self.period_s >= _LONGEST_S
             if len(key.now) < _LEAST_CORNERS:
                 continue
             if has_depth and (is_last or long or len(key.now) < _KEPT * key.count):
-                ends = (key.begin, key.now), (key.speed, speed[part][seen])
+                ends = (key.begin, key.now), (_at_end(*key.speeds[:2]), _at_end(*key.speeds[:-3:-1]))
                 self.pairs.append(PairTracks((key.frame, frame), *ends))
             else:
                 alive.append(key)
         self.keys = alive
+
+
+def _at_end(step: Array, beside: Array | None = None) -> Array:
+    """Return the speed at the outer end of a step, which has that of its middle; half a frame late, hands turn less."""
+    return step if beside is None else 1.5 * step - 0.5 * beside
 
 
 def walk(found: Survey, rig: Rig, frames: FrameTable) -> Walk:
