@@ -76,6 +76,25 @@ def test_gravity_that_contradicts(tmp_path: Path, accel: str, severity: str, wha
     assert told(inspect(str(tmp_path)), severity, what)
 
 
+def test_stuck_samples_and_frozen_and_dark_images_are_named_with_their_times(tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=60, stereo=False)
+    names = [root / "cam0" / "data" / f"{BEGIN_NS + i * FRAME_NS}.png" for i in range(60)]
+    assert not told(inspect(str(tmp_path)), "warning", "cam0")
+    for path in names[10:20]:
+        path.write_bytes(names[9].read_bytes())
+    rng = np.random.default_rng(2)
+    for path in names[40:50]:
+        cv2.imwrite(str(path), rng.integers(0, 4, (48, 64)).astype(np.uint8))
+    rows = imu_rows(600)
+    stuck = rows[299].partition(",")[2]
+    rows[300:400] = [f"{row.partition(',')[0]},{stuck}" for row in rows[300:400]]
+    (root / "imu0" / "data.csv").write_text("\n".join(rows) + "\n")
+    result = inspect(str(tmp_path))
+    assert told(result, "warning", "imu0: stuck at one value from 1.50 to 2.00 s")
+    assert told(result, "warning", "cam0: images that equal the one before from 0.50 to 0.95 s (10)")
+    assert told(result, "warning", "cam0: dark images from 2.00 to 2.50 s (10)")
+
+
 def test_rates_units_and_clocks_that_do_not_fit(tmp_path: Path) -> None:
     root = write_asl(tmp_path, frames=10, stereo=False)
     rows = [f"{BEGIN_NS + 10**12 + i * 50_000_000},0,0,60.0,0,0,9.81" for i in range(30)]

@@ -47,6 +47,11 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
     [
         ({"frames_lost": 60}, "vision lost 60 of 400 frames"),
         ({"frames_lost": 30, "longest_loss_s": 1.5}, "30 of 400 frames, 1.5 s at once"),
+        ({"frames_lost": 60, "lost_reason": "N of N"}, "at once, mostly because N of N"),
+        ({"frames": 20, "frames_lost": 8}, "vision lost 8 of 20 frames"),
+        ({"events": ("imu0: stuck at one value from 4.00 to 9.00 s",)}, "imu0: stuck at one value from 4.00 to 9.00 s"),
+        ({"is_confirmed": False}, "the start was not confirmed"),
+        ({"scale_sigma": 0.08}, "one camera's metres are known to 8 % (1 sigma) only"),
         ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),
         ({"frames_missing": 100}, "100 of 500 frames never arrived"),
         ({"frames_repeated": 40}, "40 images repeat the one before"),
@@ -87,6 +92,27 @@ def test_a_run_with_few_poses_is_lost_and_says_why():
     assert found.state is Trust.LOST
     assert "20%" in found.reasons[0]
     assert "parallax 3 px" in found.reasons[0]
+
+
+def test_a_short_run_without_an_imu_is_judged_as_a_long_one():
+    short = Evidence(mode="rgbd", frames=25, frames_lost=14, coverage=1.0, submaps_apart=6, lost_reason="too dark")
+    found = judge(short, CONFIG)
+    assert found.state is Trust.LOST
+    assert found.reasons[0] == "vision placed only 11 of 25 frames (too dark)"
+    assert any("6 submaps" in reason for reason in found.reasons)
+    assert judge(replace(short, frames_lost=2, submaps_apart=0), CONFIG).state is Trust.TRUSTED
+    assert judge(replace(SOUND, frames_lost=250, lost_reason="dark"), CONFIG).state is Trust.DOUBTFUL  # the IMU bridged
+
+
+def test_no_pose_for_most_frames_is_explained_by_what_most_frames_lacked():
+    why = "only N of N corners have depth"
+    found = judge(Evidence(frames=400, frames_lost=396, coverage=0.01, lost_reason=why), CONFIG)
+    assert found.reasons[0] == f"only 1% of the frames have a pose ({why})"
+
+
+def test_what_happened_to_a_sensor_is_said_before_what_came_of_it():
+    found = verdict(events=("imu0: stuck",), soft_resets=2, rotation=Moved(3.0, 0.1))
+    assert found.reasons[0].startswith("imu0: stuck")
 
 
 def test_what_calibration_corrected_is_told_without_a_doubt():

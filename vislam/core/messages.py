@@ -186,7 +186,7 @@ class KeyframePacket:
 
     @property
     def is_tied(self) -> bool:
-        """Whether it begins a submap and habit says where from: `vo` has the motion, though vision lost it."""
+        """Whether it begins a submap that habit ties to the one before: `vo` has the motion, though vision lost it."""
         return self.begins_submap and self.vo.tracking is Tracking.LOST and self.vo.T_keyframe_body is not None
 
 

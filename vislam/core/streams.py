@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 _NS = 1_000_000_000
-_MEDIAN_OF = 31  # intervals, that tell the usual one
+_MEDIAN_OF = 31  # intervals, whose median is the usual one
 _AT_FIRST = (3, 7, 15)  # of the first ones, too
 _HOLE = 2.5  # usual intervals
 _MOST_EVENTS = 50  # of one kind; what comes later is counted with the last

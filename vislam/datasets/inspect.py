@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding, Severity, worst
+from vislam.core.messages import ImageU8
 from vislam.datasets import survey as survey_recording
 from vislam.datasets.camera_turns import fit_turns, follow_turns, turn_findings, turn_places
 from vislam.datasets.images import (
@@ -37,6 +38,7 @@ from vislam.datasets.plausibility import (
 )
 from vislam.datasets.rgbd import rgbd_findings
 from vislam.datasets.stream import Survey, TopicSummary, frame_table, gap_limit_s, imu_gap_limit_s, open_loader
+from vislam.datasets.stream_checks import StreamChecks
 from vislam.datasets.tables import Problems, Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
@@ -50,6 +52,7 @@ _MOVING_TOLERANCE_M_S2 = 1.0  # what an honest journey may average to
 _MAX_TILT_RAD = np.deg2rad(60.0)
 _MIN_IMU_RATE_HZ = 50.0  # below it, preintegration between frames of 20 Hz has next to nothing to integrate
 _DECODED_PER_CAMERA = 200  # each image's head and end are read; this many, spread evenly, are decoded
+_EVERY_PX = 8  # each way, of the pixels by which an image is dark
 _CHECKED_PAIRS = 6
 _MIN_MATCHES = 60
 _MIN_ON_LINE = 0.5
@@ -110,6 +113,7 @@ class _Inspector:
         self._findings: list[Finding] = [Finding("error", str(error), str(found.root)) for error in found.errors]
         self._findings += [Finding("warning", str(error), str(found.root)) for error in found.lacking.values()]
         self._streams: list[StreamSummary] = []
+        self._checks = StreamChecks()
         self._size_bytes = found.streams.size_bytes if found.streams is not None else 0
 
     def run(self, uri: str) -> Inspection:
@@ -125,6 +129,8 @@ class _Inspector:
         for kind, count in self._problems.items():
             self._add_problem(kind, count, frames)
         ends = [(s.first_t_ns, s.last_t_ns) for s in self._streams if s.count]
+        begin_ns = int(frames.t_ns[0]) if frames is not None and len(frames.t_ns) else min(ends, default=(0, 0))[0]
+        self._findings += self._checks.findings(begin_ns)
         duration_ns = max(end for _, end in ends) - min(begin for begin, _ in ends) if ends else 0
         return Inspection(
             source=uri,
@@ -187,7 +193,8 @@ class _Inspector:
         """Probe every image, decode some, and report which cannot be used."""
         bad: dict[str, list[Path]] = {}
         stride = max(1, len(images.files) // _DECODED_PER_CAMERA)
-        decoded = 0
+        decoded, seen = 0, list[tuple[int, int, ImageU8]]()
+        self._checks.compare_files(images)
         for i in range(len(images.files)):
             path = images.path(i)
             try:
@@ -198,11 +205,17 @@ class _Inspector:
                 check_size_px(size, camera, path)
                 if i % stride == 0:
                     decoded += 1
-                    _ = read_depth(path, camera, DepthFormat()) if is_depth else read_grey_or_color(path, camera)
+                    if is_depth:
+                        read_depth(path, camera, DepthFormat())
+                        continue
+                    until = min(i + stride, len(images.files) - 1)
+                    grey = read_grey_or_color(path, camera)[0][::_EVERY_PX, ::_EVERY_PX]
+                    seen.append((int(images.t_ns[i]), int(images.t_ns[until]), grey.copy()))
             except UnreadableImageError as error:
                 bad.setdefault(error.kind, []).append(path)
             except DataError as error:
                 bad.setdefault(f"image of wrong size ({error})", []).append(path)
+        self._checks.look_for_dark(images.name, seen)
         for kind, paths in bad.items():
             hopeless = kind.startswith("image of wrong") or len(paths) > len(images.files) // 2
             severity: Severity = "error" if hopeless else "warning"
@@ -223,7 +236,7 @@ class _Inspector:
         if self._found.imu_file is not None:
             self._size_bytes += self._found.imu_file.stat().st_size
         try:
-            facts = imu_facts(self._rows(self._problems))
+            facts = imu_facts(self._checks.watched(self._rows(self._problems)))
         except DataError as error:
             self._add("error", str(error), str(self._found.imu_file or self._found.root))
             return None

@@ -90,9 +90,9 @@ class Waiting:
         Args:
             submaps: of all keyframes.
             poses: [M, 4, 4] of all keyframes, good within each group.
-            known: says how good.
-            tie: says how good they are between keyframes of groups that are tied; None: none are.
-            repeats_m: says how far a place is from the next one that is known to look like it.
+            known: gives how good they are.
+            tie: gives how good they are between keyframes of groups that are tied; None: none are.
+            repeats_m: gives how far a place is from the next one that is known to look like it.
         """
         pairs = [(submaps.group(e.record.from_id), submaps.group(e.record.to_id)) for e in self._edges]
         for pair in sorted({(min(p), max(p)) for p in pairs}):

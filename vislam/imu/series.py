@@ -13,7 +13,7 @@ from vislam.core.messages import Array, ImuSample, ImuSpan, NoiseScale
 from vislam.core.streams import StreamJudge
 
 _FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
-_MOST = (*3 * (1e3,), *3 * (1e4,))  # rad/s, m/s^2; beyond every sensor: such numbers come from a broken transfer
+MOST = (*3 * (1e3,), *3 * (1e4,))  # rad/s, m/s^2; beyond every sensor: such numbers come from a broken transfer
 
 
 class ImuSeries:
@@ -36,7 +36,7 @@ class ImuSeries:
         self._begin = 0
         self._end = 0
         self._newest_t_ns = -(1 << 62)
-        self.judge = StreamJudge("imu0", _MOST, max_gap_s)
+        self.judge = StreamJudge("imu0", MOST, max_gap_s)
 
     def __len__(self) -> int:
         """Return the number of samples held."""

@@ -170,7 +170,7 @@ class KeyframeChain:
 
 
 def believed(track: TrackResult, chain: KeyframeChain, frontend: FrontEnd) -> TrackResult:
-    """Return a track; lost, and the front end begins anew, where the keyframe is found where the body cannot be."""
+    """Return a track; lost, and the front end begins again, where the keyframe is found where the body cannot be."""
     if not chain.contradicts(track.vo):
         return track
     frontend.begin_at(chain.id + 1, Learned(frontend.learned.next_track_id), seeks_place=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+import re
+from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 _PIECE_S = 0.2  # over which force is averaged: noise and vibration show no scale
 _PIECES = 20  # 4 s, the longest that the search for a first scale looks at, too
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+_MOST_REASONS = 50  # that are told apart
 # a run whose quietest second has less than a third of the white noise given is warned
 _NOISE_TOLERANCE = 3.0
 
@@ -53,6 +56,8 @@ class FrontReport:
     track_noise: dict[str, Any] = field(default_factory=dict)  # of pixels: what tracks showed, and what was used for it
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # further ones, see `ReadingIntake.report`
     first_t_ns: int = 0  # of the first frame
+    is_confirmed: bool = True  # the start, by what came after it
+    lost_reason: str = ""  # why vision lost most of the frames that it lost
     events: tuple[StreamEvent, ...] = ()  # what happened in the streams of camera and IMU
 
     @property
@@ -128,6 +133,7 @@ class RunWatch:
         self.feed, self.tracks, self.uniform = CameraFeed(), NoiseUsed(), UniformMotion(config)
         self._knows_scale = knows_scale
         self._lost_since_ns: int | None = None
+        self._why_lost = Counter[str]()
 
     def note(self, track: TrackResult, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
         """Take what became of the frame that `feed` has.
@@ -144,6 +150,8 @@ class RunWatch:
             self.uniform.add(span, state, at_rest)
         counters, is_lost = self.counters, track.vo.tracking is Tracking.LOST
         counters["frames_lost"] += is_lost
+        if is_lost and (why := _NUMBER.sub("N", track.reason)):
+            self._why_lost[why if len(self._why_lost) < _MOST_REASONS else ""] += 1
         self._lost_since_ns = (self._lost_since_ns or track.vo.t_ns) if is_lost else None
         if self._lost_since_ns is not None:
             lasted_ms = (track.vo.t_ns - self._lost_since_ns) // 1_000_000
@@ -152,6 +160,11 @@ class RunWatch:
         counters["frames_at_rest"] += at_rest
         if track.by_depth:
             counters["frames_by_depth"] = counters.get("frames_by_depth", 0) + 1
+
+    @property
+    def lost_reason(self) -> str:
+        """Why vision lost most of the frames that it lost, N for numbers; empty where it lost none."""
+        return max(self._why_lost, key=self._why_lost.__getitem__, default="")
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
@@ -174,7 +187,9 @@ def report_of(front: Front) -> FrontReport:
         front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, told_noise=front.noise,
         track_noise=front.watch.tracks.summary(_given_px(front)),
         sensors={} if front.readings is None else front.readings.report(),
-        first_t_ns=front.watch.feed.first_t_ns or 0, events=tuple(sorted(events, key=lambda event: event.from_ns)),
+        first_t_ns=front.watch.feed.first_t_ns or 0, lost_reason=front.watch.lost_reason,
+        is_confirmed=not (front.gravity and front.gravity.counters.get("start_unconfirmed")),
+        events=tuple(sorted(events, key=lambda event: event.from_ns)),
     )  # fmt: skip
     if imu is None:
         return report

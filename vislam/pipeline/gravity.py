@@ -243,6 +243,7 @@ class GravityWait:
         found = self._start.newest
         if found is None or found.T_odom_vo is None:
             return []
+        self.counters["start_unconfirmed"] = 1
         self._start.settle(replace(found, reason=f"{found.reason}; not confirmed: {self._start.refusal}"))
         return self._release(found.T_odom_vo)
 

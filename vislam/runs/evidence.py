@@ -39,6 +39,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         frames=feed.get("frames", 0),
         frames_lost=front.get("frames_lost", 0),
         longest_loss_s=1e-3 * front.get("longest_loss_ms", 0),
+        lost_reason=report.lost_reason,
         frames_degraded=front.get("frames_degraded", 0),
         frames_by_depth=front.get("frames_by_depth", 0),
         frames_missing=feed.get("missing", 0),
@@ -56,6 +57,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         is_started=not has_imu or report.start is not None,
         start_reason=report.refusal,
         start_failures=sum(refusals.get(name, 0) for name in _REFUSALS),
+        is_confirmed=report.is_confirmed,
         innovations=report.nis,
         keyframes=ekf.get("keyframes", 0),
         refused=sum(refused for _, refused in offered),
@@ -111,11 +113,13 @@ class KeyframeWitness:
         self._turns: list[TurnStep] = []
         self._inertial: dict[int, Preintegrated] = {}  # by the keyframe at their end
         self._rotation: Moved | None = None
+        self._scale_sigma = 0.0
 
     def add(self, packet: KeyframePacket, update: GraphUpdate) -> None:
         """Take a keyframe and what the graph made of it."""
         span, vo = packet.imu, packet.vo
         if update.details is not None and update.newest is not None:
+            self._scale_sigma = float(update.details.get("scale_sigma") or 0.0)
             self._rotation = _window_turn(update.details.get("calibration"), self._config.window.rotation_sigma_deg)
         if span is None or packet.begins_submap or len(span.t_ns) < _SAMPLES:
             return
@@ -129,7 +133,7 @@ class KeyframeWitness:
 
     def evidence(self, ids: list[int], T_map_body: Array, states: Sequence[NavState]) -> dict[str, Any]:
         """Return the fields of `Evidence` that come of it, for the final poses [M, 4, 4] of the keyframes."""
-        found: dict[str, Any] = {"turns": turn_agreement(self._turns)}
+        found: dict[str, Any] = {"turns": turn_agreement(self._turns), "scale_sigma": self._scale_sigma}
         if self._rotation is not None:
             found["rotation"] = self._rotation
         if len(states) != len(ids):

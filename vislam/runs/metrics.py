@@ -10,14 +10,13 @@ from vislam.core.errors import DataError, TrackingLostError, VislamError
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
 from vislam.runs.pipeline import FinalGraph
-from vislam.runs.verdict import Evidence, Verdict
+from vislam.runs.verdict import Evidence, Trust, Verdict
 from vislam.trajectory import Alignment, Trajectory, evaluate
 
 _BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that reached neither filter nor graph
 _BY_FILTER = ("accepted", "gated", "refused", "waiting", "failed")
 _BY_GRAPH = ("used", "in_window", "thinned", "early")
 _NOT_IN_GRAPH = ("late", "unplaced", "crowded")
-_MIN_COVERAGE = 0.5  # of the frames that must have a pose for a run to count as a trajectory
 
 
 def accuracy(
@@ -67,7 +66,7 @@ def initialisation(front: FrontReport, first_ns: int | None) -> dict[str, Any]:
         "status": str(start.status),
         "reason": start.reason,
         "t_s": ((start.begun_t_ns or start.last.t_ns) - first_ns) * 1e-9,
-        "settled_s": (start.last.t_ns - first_ns) * 1e-9,
+        "settled_s": (start.last.t_ns - first_ns) * 1e-9 if front.is_confirmed else None,
         "scale_sigma": start.scale_sigma,
         "excitation_m_s2": start.excitation_m_s2,
     }
@@ -142,8 +141,7 @@ def refuse(metrics: dict[str, Any], out: Path) -> None:
     """Raise DataError when a run had no frame, TrackingLostError when fewer than half of them got a pose."""
     if metrics["frames"] == 0:
         raise DataError(f"{metrics['name']}: not one usable frame; run `vislam doctor` on it")
-    if metrics["coverage_frames"] < _MIN_COVERAGE:
+    if metrics["verdict"]["state"] == Trust.LOST:
         raise TrackingLostError(
-            f"{metrics['name']}: only {metrics['coverage_frames']:.0%} of the frames have a pose "
-            f"({metrics['initialisation']['reason']}); see tracking.csv and report.html in {out}"
+            f"{metrics['name']}: {metrics['verdict']['reasons'][0]}; see tracking.csv and report.html in {out}"
         )

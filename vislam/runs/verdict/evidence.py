@@ -49,6 +49,7 @@ class Evidence:
     frames: int = 0
     frames_lost: int = 0
     longest_loss_s: float = 0.0
+    lost_reason: str = ""  # why vision lost most of them
     frames_degraded: int = 0
     frames_by_depth: int = 0  # of those: placed by depth alone
     frames_missing: int = 0  # that an even rate would have brought
@@ -72,6 +73,8 @@ class Evidence:
     is_started: bool = True  # gravity was found, or there is no IMU
     start_reason: str = ""  # how it was found, or why not
     start_failures: int = 0  # attempts in which sensors contradicted each other
+    is_confirmed: bool = True  # the start, by what came after it
+    scale_sigma: float = 0.0  # relative, of one camera's metres at the end; 0: they are known, or there are none
     # the filter
     innovations: Innovations = field(default_factory=dict)  # that were accepted
     keyframes: int = 0

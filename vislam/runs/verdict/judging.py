@@ -35,6 +35,8 @@ _SIGMA_M = 1.0  # of the filter's position at its worst: no controller can use i
 _APART_SIGMAS = 3.0
 _APART_SHARE = 0.005  # of the way: closer together than this they agree, whatever their covariances
 _MIN_FRAMES = 30  # before shares of them mean anything
+_FEW_LOST = 2  # frames, that any run may lose
+_SCALE_SIGMA = 0.05  # relative, of one camera's metres: a run of ten metres is off by half a metre then
 _MIN_LOOPS = 8
 _MIN_KEYFRAMES = 10
 _SOON_S = 0.05  # that things may wait without a remark
@@ -109,8 +111,12 @@ def _misses_samples(e: Evidence) -> bool:
 
 
 def _lost(e: Evidence, _: VerdictConfig) -> Iterator[str]:
+    why = e.lost_reason or e.start_reason or "vision was lost"
     if e.frames and e.coverage < _MIN_COVERAGE:
-        yield f"only {e.coverage:.0%} of the frames have a pose ({e.start_reason or 'vision was lost'})"
+        why = why if e.frames_lost > _MIN_COVERAGE * e.frames else e.start_reason or why
+        yield f"only {e.coverage:.0%} of the frames have a pose ({why})"
+    elif not e.has_imu and e.frames_lost > (1.0 - _MIN_COVERAGE) * e.frames:
+        yield f"vision placed only {e.frames - e.frames_lost} of {e.frames} frames ({why})"
 
 
 def _streams(e: Evidence, _: VerdictConfig) -> Iterator[str]:
@@ -119,20 +125,20 @@ def _streams(e: Evidence, _: VerdictConfig) -> Iterator[str]:
 
 
 def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
-    if e.frames < _MIN_FRAMES:
-        return
-    if e.frames_lost > _LOST_SHARE * e.frames or e.longest_loss_s > _LOST_S:
+    is_long = e.frames >= _MIN_FRAMES
+    if e.frames_lost > max(_LOST_SHARE * e.frames, _FEW_LOST) or e.longest_loss_s > _LOST_S:
+        why = f", mostly because {e.lost_reason}" if e.lost_reason else ""
         yield (
-            f"vision lost {e.frames_lost} of {e.frames} frames, {e.longest_loss_s:.1f} s at once: look at tracking.csv "
-            "for when and why"
+            f"vision lost {e.frames_lost} of {e.frames} frames, {e.longest_loss_s:.1f} s at once{why}: look at "
+            "tracking.csv for when"
         )
-    if e.frames_degraded > _DEGRADED_SHARE * e.frames:
+    if is_long and e.frames_degraded > _DEGRADED_SHARE * e.frames:
         by_depth = f", {e.frames_by_depth} of them placed by depth alone" if e.frames_by_depth else ""
         yield (
             f"vision was weak in {e.frames_degraded} of {e.frames} frames{by_depth}: more light, texture or a sharper "
             "lens"
         )
-    if e.frames_missing > _MISSING_SHARE * (e.frames + e.frames_missing) and not _is_slow(e):
+    if is_long and e.frames_missing > _MISSING_SHARE * (e.frames + e.frames_missing) and not _is_slow(e):
         yield (
             f"{e.frames_missing} of {e.frames + e.frames_missing} frames never arrived: look at the camera's cable, "
             "its driver and the load of the machine"
@@ -150,6 +156,13 @@ def _start(e: Evidence, _: VerdictConfig) -> Iterator[str]:
         yield (
             f"vision and inertial data contradicted each other in {e.start_failures} attempts to start: check axes and "
             f"units of the IMU, then {_CALIBRATE}"
+        )
+    elif not e.is_confirmed:
+        yield "the start was not confirmed before the end: scale may err by more than its sigma; go on longer"
+    if e.scale_sigma > _SCALE_SIGMA:
+        yield (
+            f"one camera's metres are known to {100.0 * e.scale_sigma:.0f} % (1 sigma) only: move with more changes of "
+            "speed, or use a second camera or depth"
         )
 
 
