@@ -20,7 +20,7 @@ from vislam.runs.folder import prepare
 from vislam.runs.report.run_files import read_run
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
-from vislam.trajectory import read_tum
+from vislam.trajectory import Trajectory, evaluate, read_tum
 from worlds.shared import shared
 
 REPLAYED = ("trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum", "loops.csv", "states_graph.csv")
@@ -150,6 +150,30 @@ def test_an_imu_hole_of_one_second_is_counted_and_survived(small_room, tmp_path)
     assert metrics["counters"]["front"]["imu_outages"] > 0
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.05
     assert metrics["coverage_frames"] == 1.0
+
+
+@pytest.mark.parametrize(("imu", "most_m"), [(False, 0.02), (True, 0.5)])  # a filter that was turned meanwhile errs
+def test_a_clock_that_steps_back_is_named_and_what_follows_is_tied_to_nothing_before(recorded, tmp_path, imu, most_m):
+    shutil.copytree(recorded, tmp_path / "room")
+    clean, back_ns = open_source(str(recorded)), 1_000_000_000
+    first_ns = next(value.t_ns for value in clean.events() if isinstance(value, Frame))
+    for table in (tmp_path / "room").rglob("data.csv"):
+        if "mocap" not in str(table):
+            lines = [line.partition(",") for line in table.read_text().splitlines()]
+            late = [t.isdigit() and int(t) > first_ns + 4_000_000_000 for t, _, _ in lines]
+            moved = [str(int(t) - back_ns) if is_late else t for (t, _, _), is_late in zip(lines, late, strict=True)]
+            table.write_text("".join(f"{t}{line[1]}{line[2]}\n" for t, line in zip(moved, lines, strict=True)))
+    source = open_source(str(tmp_path / "room"))
+    metrics = run(source, tmp_path / "run", map__enabled=False, imu__enabled=imu)
+    steps = {event["stream"]: event for event in metrics["events"] if event["happening"] == "step back"}
+    assert {"cam0", "imu"} <= set(steps)
+    assert all(abs(event["from_s"] - 4.0) < 0.15 and abs(event["to_s"] - 3.0) < 0.15 for event in steps.values())
+    assert "the clock stepped back" in metrics["verdict"]["reasons"][0]
+    assert metrics["counters"]["front"]["submaps"] == 2
+    odometry, truth = read_tum(tmp_path / "run" / "trajectory_ekf.tum"), clean.truth()
+    after = odometry.t_ns > first_ns + 4_000_000_000
+    moved = Trajectory(odometry.t_ns[after] + back_ns, odometry.T_world_body[after])
+    assert evaluate(moved, truth, "yaw" if imu else "se3")["ate_rmse_m"] < most_m
 
 
 def test_duplicate_backward_and_nan_samples_are_counted_not_used(small_room, tmp_path):

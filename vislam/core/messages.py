@@ -126,6 +126,7 @@ class Frame:
     depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
     tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
     depth_lag_s: float = 0.0  # how much later than the images depth was taken, by its own stamp
+    follows_step: bool = False  # of the clock: how long after the frame before it was taken is not known
 
     def __repr__(self) -> str:
         has = [f"{image.shape[1]} x {image.shape[0]} px" for image in self.images]

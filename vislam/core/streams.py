@@ -137,6 +137,10 @@ class StreamJudge:
             self._look_for_hole(newest, t_ns)
         return True
 
+    def correct(self, t_ns: int) -> None:
+        """Take the stamp of the newest row for a wrong one, which had leapt ahead: a row at `t_ns` is in its place."""
+        self._newest_ns = t_ns
+
     def note(self, happening: Happening, from_ns: int, to_ns: int, rows: int = 1) -> None:
         """Take note of what happened; the same again soon after is one event with it."""
         known = self._events.setdefault(happening, [])

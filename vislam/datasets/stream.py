@@ -17,6 +17,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.streams import Happening
 from vislam.datasets.formats.truth import Truth
 from vislam.datasets.images import (
     DepthFormat,
@@ -216,6 +217,8 @@ class FileRecording:
         self._counter.update(survey.problems)
         self._frames = frame_table(survey, self._counter)
         self._known = dict(self._counter)
+        judges = survey.problems.judges.values()
+        self._steps_ns = [e.from_ns for j in judges for e in j.events if e.happening is Happening.STEP_BACK]
         self.problems: dict[str, int] = self._counter
         self.frame_count = len(self._frames.t_ns)
         if not self.frame_count:
@@ -230,6 +233,7 @@ class FileRecording:
         when most rows of a file are unusable.
         """
         self._counter.restart(self._known)
+        self._counter.judges = dict(self._survey.problems.judges)
         reading = self._read_frames(from_ns)
         with closing(reading) as frames, closing(self._read_imu()) as imu, closing(self._read_mag()) as mag:
             streams: list[Iterator[ImuSample | MagSample | Frame]] = [imu, mag, frames]
@@ -276,7 +280,7 @@ class FileRecording:
                     continue
 
     def _read_frames(self, from_ns: int | None) -> Generator[Frame, None, None]:
-        gaps = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter)
+        gaps, last_ns = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter), None
         with closing(open_loader(self._survey, self.rig, self._frames, self.cameras_read)) as loader:
             index = 0 if from_ns is None else int(np.searchsorted(self._frames.t_ns, from_ns))
             with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers)) as decoded:
@@ -286,7 +290,12 @@ class FileRecording:
                     if loaded.images:
                         gaps.see(t_ns)
                         lag_s = self._depth_lag_s(index)
-                        yield Frame(t_ns, index, loaded.images, loaded.color, loaded.depth_m, depth_lag_s=lag_s)
+                        is_torn = last_ns is not None and any(last_ns <= step_ns < t_ns for step_ns in self._steps_ns)
+                        yield Frame(
+                            t_ns, index, loaded.images, loaded.color, loaded.depth_m, depth_lag_s=lag_s,
+                            follows_step=is_torn,
+                        )  # fmt: skip
+                        last_ns = t_ns
                         index += 1
 
     def _depth_lag_s(self, index: int) -> float:

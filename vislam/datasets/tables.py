@@ -14,6 +14,7 @@ from typing import IO, TypeVar
 
 from vislam.core.errors import DataError
 from vislam.core.reading import open_file
+from vislam.core.streams import StreamJudge
 
 T = TypeVar("T")
 Row = tuple[int, T]  # stamp in ns, and what the row holds
@@ -27,11 +28,16 @@ _LEAP_NS = 1_000_000_000  # a stamp that leaps further ahead than this, and back
 
 
 class Problems(dict[str, int]):
-    """Counts of what was skipped, by kind; the text of a kind names the place of its first case."""
+    """Counts of what was skipped, by kind; the text of a kind names the place of its first case.
+
+    Attributes:
+        judges: of the stamps of streams, by name: what happened in them, and when.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self._keys: dict[str, str] = {}
+        self.judges: dict[str, StreamJudge] = {}
 
     def count(self, kind: str, where: str = "", times: int = 1) -> None:
         """Add `times` cases of `kind`; `where` is kept for the first case only."""
@@ -190,6 +196,7 @@ def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str, keep_eq
     A stamp that goes back is dropped, unless the stamp before it had leapt ahead: then that one is the wrong one, and
     dropping it saves everything behind it.
     """
+    judge = problems.judges[what] = StreamJudge(what)
     last_ns: int | None = None
     held: Row[T] | None = None
     for row in rows:
@@ -199,12 +206,16 @@ def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str, keep_eq
                 yield held
                 last_ns = held[0]
             held = row
+            judge.takes(t_ns)
         elif t_ns == held[0]:
+            judge.takes(t_ns)
             problems.count(f"{what}: duplicate stamp", f"{t_ns} ns")
         elif (last_ns is None or t_ns > last_ns) and held[0] - t_ns > _LEAP_NS:
             problems.count(f"{what}: stamp that leaps ahead", f"{held[0]} ns")
             held = row
+            judge.correct(t_ns)
         else:
+            judge.takes(t_ns)
             problems.count(f"{what}: backward stamp", f"{t_ns} ns")
     if held is not None:
         yield held

@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # the fast path must not load OpenCV
     from vislam.core.camera import Rig
 
 _MOST_APPLIED = 4096  # readings of further sensors; only a live run asks for them, many times a second
+_TORN = np.array([0.5, 5.0, 3.0, 0.0, 0.0])  # rad, m, m/s: what may have happened meanwhile; biases stay
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
@@ -66,6 +67,16 @@ class Filtering:
         """Start at a state in the past."""
         self._start_ns = state.t_ns
         self.ekf.initialise(state, vo)
+
+    def tear(self, vo: VoMeasurement) -> None:
+        """Give up what is known of the motion: before the frame of `vo`, which is lost, an unknown time has passed.
+
+        The pose in `odom` stays, as nothing is known that would move it.
+        """
+        state = self.ekf.state_at(vo.t_ns)
+        if state is not None:
+            covariance = state.covariance + np.diag(np.repeat(_TORN, 3) ** 2)
+            self.ekf.resume(replace(state, covariance=covariance), vo, self.ekf.camera)
 
     def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""

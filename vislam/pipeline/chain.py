@@ -11,6 +11,7 @@ from vislam.core.geometry import invert, se3_adjoint, se3_log
 from vislam.core.memory import Learned
 from vislam.core.messages import (
     Array,
+    Frame,
     ImuSpan,
     Keyframe,
     KeyframePacket,
@@ -23,6 +24,7 @@ from vislam.core.messages import (
 from vislam.frontend import FrontEnd, TrackResult
 from vislam.frontend.result import lost_motion, scaled_motion
 from vislam.pipeline.coasting import Coasting
+from vislam.pipeline.inertial_stages import Inertial
 
 _CONTRADICTION = chi_square_limit(0.9999, 6)
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
@@ -40,6 +42,7 @@ class KeyframeChain:
         mag: the newest sample of the magnetometer since then.
         T_vo_body: [4, 4] at the newest frame.
         T_odom_body: [4, 4] there as it was last known; None: never, or lost.
+        is_torn: whether an unknown time has passed since the keyframe.
     """
 
     def __init__(self, T_vo_body: Array, submap_sigma_m: float) -> None:
@@ -52,7 +55,7 @@ class KeyframeChain:
         self._T_odom_keyframe: Array | None = None
         self._rests = True  # since the keyframe
         self._variance_m2 = 0.0  # of the filter's position there
-        self._is_lost = False
+        self._is_lost, self.is_torn = False, False
         self._coasting = Coasting()
         self._placed: tuple[Array, Array] | None = None  # newest frame that was: motion, covariance
         self._most_m2 = submap_sigma_m**2
@@ -60,6 +63,11 @@ class KeyframeChain:
     def begin_at(self, T_vo_body: Array) -> None:
         """Take the pose [4, 4] of the keyframe at which an earlier run ended."""
         self._T_vo_keyframe, self.T_vo_body = T_vo_body, T_vo_body.copy()
+
+    def tear(self) -> None:
+        """Forget how the body moved: what comes next is after an unknown time."""
+        self._coasting.restart()
+        self._placed, self.is_torn = None, True
 
     def follow(self, vo: VoMeasurement, at_rest: bool) -> None:
         """Take a frame's motion since the keyframe, and whether the body rested over it."""
@@ -123,7 +131,7 @@ class KeyframeChain:
         self._rests, self.mag = True, None
         self._T_vo_keyframe = self.T_vo_body.copy()
         self._T_odom_keyframe = T_odom_body
-        self._placed = np.eye(4), np.zeros((6, 6))
+        self._placed, self.is_torn = (np.eye(4), np.zeros((6, 6))), False
 
     def place(self, T_odom_keyframe: Array | None) -> None:
         """Take where the newest keyframe is in `odom` [4, 4], None: that is not known."""
@@ -176,6 +184,17 @@ def believed(track: TrackResult, chain: KeyframeChain, frontend: FrontEnd) -> Tr
     frontend.begin_at(chain.id + 1, Learned(frontend.learned.next_track_id), seeks_place=True)
     vo = lost_motion(track.vo.t_ns, chain.id, track.vo.has_scale)
     return TrackResult(vo, no_observations(), None, 0.0, "what was found looks like the keyframe, too far away")
+
+
+def torn(frame: Frame, chain: KeyframeChain, frontend: FrontEnd, imu: Inertial | None) -> bool:
+    """Tie nothing from a frame on to what was before, if the clock stepped there; return whether it did."""
+    if not frame.follows_step:
+        return False
+    frontend.begin_at(chain.id + 1, Learned(frontend.learned.next_track_id), seeks_place=True)
+    chain.tear()
+    if imu is not None:
+        imu.filtering.tear(lost_motion(frame.t_ns, chain.id, True))
+    return True
 
 
 def _variance_m2(state: NavState | None) -> float:

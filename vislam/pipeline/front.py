@@ -31,7 +31,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.imu import ImuNoise
-from vislam.pipeline.chain import KeyframeChain, believed
+from vislam.pipeline.chain import KeyframeChain, believed, torn
 from vislam.pipeline.dark import Waypoints, unseen_keyframe
 from vislam.pipeline.front_report import FrontReport, RunWatch, report_of
 from vislam.pipeline.gravity import GravityWait, Phase, Start
@@ -93,9 +93,7 @@ class Front:
         self.readings: ReadingIntake | None = None
         if suite is not None and len(suite):
             self.readings = ReadingIntake.of_run(config, suite, noise, self.inertial)
-        self._clock = clock
-        self._waypoints = Waypoints()
-        self._published = in_odom(config)
+        self._clock, self._waypoints, self._published = clock, Waypoints(), in_odom(config)
         self._last_frame_t_ns: int | None = None
 
     def resume(self, memory: FrontMemory) -> None:
@@ -155,6 +153,8 @@ class Front:
         self.watch.feed.add(frame)
         frame = self.camera_clock.in_imu_time(frame)
         imu = self._imu
+        if torn(frame, self._chain, self.frontend, imu):
+            self._last_frame_t_ns = None
         since = Since() if imu is None else imu.since(self._last_frame_t_ns, frame.t_ns, self.camera_clock)
         with self._clock.measure("track"):
             track = self._track(frame, since)
@@ -259,7 +259,7 @@ class Front:
     ) -> list[OdometryKeyframe]:
         """Pack a new keyframe with all that the back end needs of it; return it unless it has to wait for gravity."""
         chain, holds, imu = self._chain, self.begun.holds_keyframes, None
-        if self._imu is not None and chain.id >= 0:
+        if self._imu is not None and chain.id >= 0 and not chain.is_torn:
             imu = self._imu.buffer.span(chain.t_ns, keyframe.t_ns)
         packet = chain.packet(track, keyframe, imu, state, self.camera_clock.applied_s)
         self.watch.counters["submaps"] += packet.begins_submap

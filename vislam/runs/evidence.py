@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from math import isfinite
@@ -22,6 +22,7 @@ from vislam.runs.verdict import Apart, Evidence, Moved, TurnStep, force_agreemen
 from vislam.trajectory import Trajectory, align, associate
 
 _MIN_COMPARED = 10  # poses
+_AT_ONCE_NS = 200_000_000
 _SAMPLES = 4  # of a span, at least, for a judgement
 _REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
 _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
@@ -69,7 +70,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         uniform_s=report.uniform_s,
         gravity_m_s2=machine.gravity_m_s2,
         max_gap_s=machine.max_gap_s,
-        events=tuple(event.words(report.first_t_ns) for event in report.events if _matters(event, machine.max_gap_s)),
+        events=tuple(_together([e for e in report.events if _matters(e, machine.max_gap_s)], report.first_t_ns)),
         **_calibration(report.calibration),
     )
     condition, noise, given = report.condition, report.noise_ratios, report.told_noise
@@ -92,6 +93,16 @@ def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     lasted_s = (event.to_ns - event.from_ns) * 1e-9
     is_gone = event.happening in (Happening.STUCK, Happening.UNUSABLE) and lasted_s > max_gap_s
     return is_gone or event.happening is Happening.STEP_BACK
+
+
+def _together(events: Sequence[StreamEvent], begin_ns: int) -> Iterator[str]:
+    """Yield events in words, what happened to several streams at once as one."""
+    groups: dict[tuple[str, int], list[StreamEvent]] = {}
+    for event in events:
+        near = (k for k in groups if k[0] == event.happening and abs(k[1] - event.from_ns) < _AT_ONCE_NS)
+        groups.setdefault(next(near, (event.happening, event.from_ns)), []).append(event)
+    for some in groups.values():
+        yield replace(some[0], stream=", ".join(event.stream for event in some)).words(begin_ns)
 
 
 def _calibration(learned: dict[str, float]) -> dict[str, Any]:
