@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -43,10 +44,11 @@ class StreamChecks:
         judge, last = StreamJudge(images.name), (-1, Path())
         self._judges.append(judge)
         for i, t_ns in enumerate(images.t_ns.tolist()):
-            path = images.path(i)
-            size = path.stat().st_size if path.is_file() else -1
-            if size == last[0] > 0 and path != last[1] and path.read_bytes() == last[1].read_bytes():
-                judge.note(Happening.REPEATED, t_ns, t_ns)
+            path, size = images.path(i), -1
+            with suppress(OSError):  # what is missing is reported elsewhere
+                size = path.stat().st_size
+                if size == last[0] > 0 and path != last[1] and path.read_bytes() == last[1].read_bytes():
+                    judge.note(Happening.REPEATED, t_ns, t_ns)
             last = size, path
 
     def look_for_dark(self, name: str, seen: Iterable[tuple[int, int, ImageU8]]) -> None:
