@@ -149,6 +149,17 @@ def test_two_places_that_habit_does_not_tell_apart_are_rivals_and_the_submap_sta
     assert tied(loose(world, imu=False), world, {k: edges[k][:1] for k in frames}, 0.5).submaps.groups == (0, 0)
 
 
+def test_where_places_are_known_to_repeat_within_reach_a_submap_stays_apart(world: World) -> None:
+    """Loops inside the old submap that miss all by the same step in map tell of a wall of equal panels."""
+    step = transform(np.eye(3), np.array([1.5, 0.0, 0.0]))
+    alike = {
+        k: [replace(world.loop(k, k - 80, k), T_from_to=invert(world.truth[k - 80]) @ step @ world.truth[k])]
+        for k in (110, 120, 130)
+    }
+    true = {k: panels_further(world, (k,), 0.0, 10 * k) for k in (152, 154, 156, 158, 160, 162)}
+    assert tied(loose(world, imu=False), world, alike | true, 0.5).submaps.groups == (0, 1)
+
+
 def test_a_submap_that_nothing_joins_stays_where_habit_has_it(world: World) -> None:
     graph = loose(world, imu=False)
     tied(graph, world, {}, 0.3)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from vislam.config import LoopConfig
@@ -14,7 +15,7 @@ from vislam.loop.verification import verifier as verifier_module
 from vislam.loop.verification.relative_pose import Matched, errors, refine
 from vislam.loop.verification.verifier import Verifier
 from vislam.loop.view import View, make_view
-from worlds.landmarks import LandmarkWorld, body_pose, room
+from worlds.landmarks import LandmarkWorld, body_pose, make_rig, room
 
 PAIRS = 40
 BARE = replace(LoopConfig(), covariance_inflation=1.0, sigma_floor_m=0.0, sigma_floor_deg=0.0)
@@ -246,3 +247,28 @@ def test_a_pair_without_depth_and_with_too_few_matches_is_not_searched(world: La
     found = Verifier(config, world.rig, 0).verify(a, b)
     assert found.T_a_b is None and found.matches >= config.min_inliers
     assert found.reason == f"too few matches: {found.matches}, needs 10000 without depth"
+
+
+def test_of_equal_panels_the_one_where_the_map_has_it_is_found() -> None:
+    """View b sees the second of two panels, whose descriptors are nearer to those of the first."""
+    rng, rig = np.random.default_rng(6), make_rig()
+    panel, bits = (
+        rng.uniform([-0.6, -0.8, 3.0], [0.6, 0.8, 3.6], (60, 3)),
+        rng.integers(0, 256, (60, 32)).astype(np.uint8),
+    )
+    second, step = bits.copy(), np.array([1.5, 0.0, 0.0])
+    second[:, 0] ^= 0b1111
+    T_cams = invert(rig.T_body_cams[0]) @ se3_exp(np.array([0.0, 0.0, 0.0, 0.0, -0.4, 0.0])) @ rig.T_body_cams[0]
+
+    def view(number: int, points: Array, descriptors: NDArray[np.uint8]) -> View:
+        xy = (points[:, :2] / points[:, 2:]).astype(np.float32)
+        return View(number, number, descriptors, xy, points.astype(np.float32))
+
+    a = view(0, np.vstack([panel, panel + step]), np.vstack([bits, second]))
+    b = view(1, panel + step - T_cams[:3, 3], bits)
+    verifier = Verifier(LoopConfig(), rig, 0)
+    T_true = rig.T_body_cams[0] @ T_cams @ invert(rig.T_body_cams[0])
+    alone, guided = verifier.verify(a, b), verifier.verify(a, b, None, T_true)
+    assert alone.T_a_b is not None and guided.T_a_b is not None
+    assert np.linalg.norm(alone.T_a_b[:3, 3] - T_true[:3, 3]) > 1.0
+    np.testing.assert_allclose(guided.T_a_b, T_true, atol=0.02)

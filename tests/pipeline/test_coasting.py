@@ -5,9 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vislam import Frame, Observations
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, se3_log, so3_exp, transform
+from vislam.core.messages import Tracking, VoMeasurement
+from vislam.frontend import TrackResult
+from vislam.pipeline.chain import KeyframeChain
 from vislam.pipeline.coasting import Coasting
+from vislam.pipeline.dark import unseen_keyframe
 from vislam.sim.motion.motions import world_motion
 
 NS = 1_000_000_000
@@ -57,3 +62,18 @@ def test_a_wild_motion_leaves_less_to_expect() -> None:
     one, other = calm.ahead(105 * NS // 10), wild.ahead(105 * NS // 10)
     assert one is not None and other is not None
     assert other[1][3, 3] > 10.0 * one[1][3, 3]
+
+
+@pytest.mark.parametrize("is_torn", [False, True])
+def test_a_submap_is_tied_by_habit_unless_an_unknown_time_has_passed(is_torn: bool) -> None:
+    chain, frame = KeyframeChain(np.eye(4), 5.0), Frame(2 * NS, 20, ())
+    for k in range(20):
+        moved = transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
+        chain.follow(VoMeasurement(k * NS // 10, 0, moved, np.eye(6) * 1e-6, True, Tracking.OK, 50), False)
+    chain.extend(unseen_keyframe(0, frame), None, None)
+    if is_torn:
+        chain.tear()
+    keyframe = unseen_keyframe(1, frame)
+    lost = VoMeasurement(2 * NS, 0, None, np.eye(6), True, Tracking.LOST, 0)
+    track = TrackResult(lost, Observations(np.empty(0, np.int64), np.empty((0, 2))), keyframe, 0.0, "")
+    assert chain.packet(track, keyframe, None, None, 0.0).is_tied is not is_torn
