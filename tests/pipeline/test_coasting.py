@@ -70,10 +70,13 @@ def test_a_submap_is_tied_by_habit_unless_an_unknown_time_has_passed(is_torn: bo
     for k in range(20):
         moved = transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
         chain.follow(VoMeasurement(k * NS // 10, 0, moved, np.eye(6) * 1e-6, True, Tracking.OK, 50), False)
-    chain.extend(unseen_keyframe(0, frame), None, None)
+    placed = VoMeasurement(2 * NS, 0, np.eye(4), np.eye(6), True, Tracking.OK, 50)
+    nothing = Observations(np.empty(0, np.int64), np.empty((0, 2)))
+    first = TrackResult(placed, nothing, unseen_keyframe(0, frame), 0.0, "")
+    chain.extend(chain.packet(first, unseen_keyframe(0, frame), None, None, 0.0), None, None)
     if is_torn:
         chain.tear()
     keyframe = unseen_keyframe(1, frame)
     lost = VoMeasurement(2 * NS, 0, None, np.eye(6), True, Tracking.LOST, 0)
-    track = TrackResult(lost, Observations(np.empty(0, np.int64), np.empty((0, 2))), keyframe, 0.0, "")
+    track = TrackResult(lost, nothing, keyframe, 0.0, "")
     assert chain.packet(track, keyframe, None, None, 0.0).is_tied is not is_torn

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from vislam.core.messages import ImageU8
+
 _NS = 1_000_000_000
 _MEDIAN_OF = 31  # intervals, whose median is the usual one
 _AT_FIRST = (3, 7, 15)  # of the first ones, too
@@ -20,6 +22,7 @@ _MOST_EVENTS = 50  # of one kind; what comes later is counted with the last
 _TOGETHER_NS = _NS // 2  # what happens again so soon is the same event
 _CHANGES = 100  # pairs of neighbours that differ, after which equal ones are a surprise
 _BY_CHANCE = 1e-6  # runs of equal rows as long that a whole stream has by chance
+_DARK = 3.0  # mean grey, and as much of its scatter, below which an image shows nothing
 _STEP_ROWS = 5  # in order among each other, behind what came before: the clock stepped; fewer are rows that came late
 
 
@@ -91,6 +94,11 @@ _WORDS = {
     Happening.UNUSABLE: "rows that are no measurement",
     Happening.DARK: "dark images",
 }
+
+
+def is_dark(image: ImageU8) -> bool:
+    """Return whether an image [H, W] shows nothing."""
+    return bool(image.mean() < _DARK and image.std() < _DARK)
 
 
 class StreamJudge:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding, Severity, worst
-from vislam.core.messages import ImageU8
 from vislam.datasets import survey as survey_recording
 from vislam.datasets.camera_turns import fit_turns, follow_turns, turn_findings, turn_places
 from vislam.datasets.images import (
@@ -52,7 +51,6 @@ _MOVING_TOLERANCE_M_S2 = 1.0  # what an honest journey may average to
 _MAX_TILT_RAD = np.deg2rad(60.0)
 _MIN_IMU_RATE_HZ = 50.0  # below it, preintegration between frames of 20 Hz has next to nothing to integrate
 _DECODED_PER_CAMERA = 200  # each image's head and end are read; this many, spread evenly, are decoded
-_EVERY_PX = 8  # each way, of the pixels by which an image is dark
 _CHECKED_PAIRS = 6
 _MIN_MATCHES = 60
 _MIN_ON_LINE = 0.5
@@ -193,7 +191,7 @@ class _Inspector:
         """Probe every image, decode some, and report which cannot be used."""
         bad: dict[str, list[Path]] = {}
         stride = max(1, len(images.files) // _DECODED_PER_CAMERA)
-        decoded, seen = 0, list[tuple[int, int, ImageU8]]()
+        decoded = 0
         self._checks.compare_files(images)
         for i in range(len(images.files)):
             path = images.path(i)
@@ -209,13 +207,12 @@ class _Inspector:
                         read_depth(path, camera, DepthFormat())
                         continue
                     until = min(i + stride, len(images.files) - 1)
-                    grey = read_grey_or_color(path, camera)[0][::_EVERY_PX, ::_EVERY_PX]
-                    seen.append((int(images.t_ns[i]), int(images.t_ns[until]), grey.copy()))
+                    grey, _ = read_grey_or_color(path, camera)
+                    self._checks.look_at(images.name, grey, int(images.t_ns[i]), int(images.t_ns[until]))
             except UnreadableImageError as error:
                 bad.setdefault(error.kind, []).append(path)
             except DataError as error:
                 bad.setdefault(f"image of wrong size ({error})", []).append(path)
-        self._checks.look_for_dark(images.name, seen)
         for kind, paths in bad.items():
             hopeless = kind.startswith("image of wrong") or len(paths) > len(images.files) // 2
             severity: Severity = "error" if hopeless else "warning"

@@ -100,9 +100,8 @@ class Waiting:
             if len({e.record.to_id for e in edges}) < JOIN_FRAMES:
                 continue
             ends = _Ends(poses, submaps, pair[1])
-            tied = [] if tie is None else [e.record for e in edges if e.record.has_scale]
-            tied = [r for r in tied if submaps.are_tied(r.from_id, r.to_id)]
-            ties = {r.id: tie(r.from_id, r.to_id) for r in tied} if tie is not None else {}
+            tied = [r for e in edges if (r := e.record).has_scale and submaps.are_tied(r.from_id, r.to_id)]
+            ties = {} if tie is None else {r.id: tie(r.from_id, r.to_id) for r in tied}
             fitting = [e for e in edges if e.record.id not in ties or self._fits(e, ties[e.record.id], ends)]
             found = self._place(fitting, ends, known)
             if found is not None and not self._has_rival(found, edges, ties, ends, repeats_m()):

@@ -119,15 +119,15 @@ class KeyframeChain:
         begins_submap = track.vo.tracking is Tracking.LOST and not self.is_bridged(keyframe.t_ns, imu, state)
         vo = self._with_habit(track.vo) if begins_submap and imu is None else track.vo
         begins_submap = begins_submap or keyframe.id == self.first_id > 0
-        if begins_submap:
-            self._coasting.restart()
         at_rest = self._rests and self.id >= 0
         return KeyframePacket(keyframe, vo, track.observations, imu, self.mag, at_rest, offset_s, begins_submap)
 
-    def extend(self, keyframe: Keyframe, T_odom_body: Array | None, state: NavState | None) -> None:
-        """Make a keyframe, whose packet is made, the newest."""
+    def extend(self, packet: KeyframePacket, T_odom_body: Array | None, state: NavState | None) -> None:
+        """Make the keyframe of a packet the newest."""
+        if packet.begins_submap:
+            self._coasting.restart()
         self._variance_m2 = _variance_m2(state)
-        self.id, self.t_ns = keyframe.id, keyframe.t_ns
+        self.id, self.t_ns = packet.keyframe.id, packet.keyframe.t_ns
         self._rests, self.mag = True, None
         self._T_vo_keyframe = self.T_vo_body.copy()
         self._T_odom_keyframe = T_odom_body
@@ -171,17 +171,21 @@ class KeyframeChain:
 
     def _with_habit(self, vo: VoMeasurement) -> VoMeasurement:
         """Return the measurement of a frame that vision lost, with the motion that habit makes likely."""
-        coasted = self._coasted(vo.t_ns)
-        if coasted is None or vo.T_keyframe_body is not None:
+        if (coasted := self._coasted(vo.t_ns)) is None:
             return vo
         return replace(vo, T_keyframe_body=coasted[0], covariance=coasted[1], has_scale=True)
+
+
+def seek_place(frontend: FrontEnd, keyframe_id: int) -> None:
+    """Let a front end begin again with its next frame, as keyframe `keyframe_id`, as after a loss."""
+    frontend.begin_at(keyframe_id, Learned(frontend.learned.next_track_id), seeks_place=True)
 
 
 def believed(track: TrackResult, chain: KeyframeChain, frontend: FrontEnd) -> TrackResult:
     """Return a track; lost, and the front end begins again, where the keyframe is found where the body cannot be."""
     if not chain.contradicts(track.vo):
         return track
-    frontend.begin_at(chain.id + 1, Learned(frontend.learned.next_track_id), seeks_place=True)
+    seek_place(frontend, chain.id + 1)
     vo = lost_motion(track.vo.t_ns, chain.id, track.vo.has_scale)
     return TrackResult(vo, no_observations(), None, 0.0, "what was found looks like the keyframe, too far away")
 
@@ -190,7 +194,7 @@ def torn(frame: Frame, chain: KeyframeChain, frontend: FrontEnd, imu: Inertial |
     """Tie nothing from a frame on to what was before, if the clock stepped there; return whether it did."""
     if not frame.follows_step:
         return False
-    frontend.begin_at(chain.id + 1, Learned(frontend.learned.next_track_id), seeks_place=True)
+    seek_place(frontend, chain.id + 1)
     chain.tear()
     if imu is not None:
         imu.filtering.tear(lost_motion(frame.t_ns, chain.id, True))

@@ -31,7 +31,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.imu import ImuNoise
-from vislam.pipeline.chain import KeyframeChain, believed, torn
+from vislam.pipeline.chain import KeyframeChain, believed, seek_place, torn
 from vislam.pipeline.dark import Waypoints, unseen_keyframe
 from vislam.pipeline.front_report import FrontReport, RunWatch, report_of
 from vislam.pipeline.gravity import GravityWait, Phase, Start
@@ -240,7 +240,7 @@ class Front:
             return track
         self.watch.counters["waypoints"] = self.watch.counters.get("waypoints", 0) + 1
         keyframe = unseen_keyframe(self._chain.id + 1, frame)
-        self.frontend.begin_at(keyframe.id + 1, Learned(self.frontend.learned.next_track_id), seeks_place=True)
+        seek_place(self.frontend, keyframe.id + 1)
         return replace(track, keyframe=keyframe, vo=lost_motion(frame.t_ns, self._chain.id, track.vo.has_scale))
 
     def _estimate(self, track: TrackResult, since: Since, at_rest: bool) -> tuple[Estimate | None, NavState | None]:
@@ -266,7 +266,7 @@ class Front:
         if self.readings is not None and not holds:
             packet = self._waypoints.marked(self.readings.pack(packet, chain.t_ns, state), state)
         self.camera_clock.took_keyframe()
-        chain.extend(keyframe, T_odom_body, state)
+        chain.extend(packet, T_odom_body, state)
         if T_odom_body is not None and not holds:
             return [OdometryKeyframe(packet, T_odom_body)]
         assert self.gravity is not None

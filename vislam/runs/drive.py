@@ -150,7 +150,7 @@ class Run:
         """Process the whole recording and write every file; return the metrics.
 
         Whatever happens, what was computed is written, after an interrupt without map and pictures; then the error is
-        raised. Raises TrackingLostError when fewer than half of the frames got a pose.
+        raised. Raises TrackingLostError when the verdict is that it is lost.
         """
         start = time.perf_counter()
         _LOG.info("%s, %s frames", self.recording.name, self.recording.frame_count or "unknown")

@@ -138,7 +138,7 @@ def _in_graph(came: dict[str, int], did: dict[str, int], since: int) -> dict[str
 
 
 def refuse(metrics: dict[str, Any], out: Path) -> None:
-    """Raise DataError when a run had no frame, TrackingLostError when fewer than half of them got a pose."""
+    """Raise DataError when a run had no frame, TrackingLostError when its verdict is that it is lost."""
     if metrics["frames"] == 0:
         raise DataError(f"{metrics['name']}: not one usable frame; run `vislam doctor` on it")
     if metrics["verdict"]["state"] == Trust.LOST:
