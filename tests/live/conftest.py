@@ -26,10 +26,10 @@ def interrupted(patient_end: None, tmp_path_factory: pytest.TempPathFactory) -> 
     """A run that was ended by Ctrl-C when it had a map, and its metrics; of all workers: who resumes it copies it."""
 
     def make(folder: Path) -> None:
-        live = begin(folder / "run")
+        live = begin(folder / "run", name="shared")
         live.execute(until(has_map, interrupt), PATIENCE_S)
         assert live.is_brief
-        assert left_behind() == []
+        assert left_behind("shared") == []
 
     out = shared(tmp_path_factory, "interrupted-live", make) / "run"
     return out, json.loads((out / "metrics.json").read_text())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from vislam.live.beginning import in_map, resumed
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
 from vislam.runs.folder import MapChoice, prepare
+from vislam.runs.session import Session
 
 PATIENCE_S = 600.0  # a quiet machine needs a few of them; the recording goes on as long
 WORLD = f"points:laps,rig=rgbd,camera_hz=10,tracks=150,duration_s={PATIENCE_S:g}"
@@ -38,10 +40,15 @@ def settings(name: str = "going-on", *, dense: bool = False, **others: object) -
     return load(None, {**off, "live.name": f"vislam-test-{name}-{os.getpid()}", **live})
 
 
-def begin(out: Path, base: MapChoice | None = None, outages: Outages | None = None, *, dense: bool = False) -> LiveRun:
-    """Return a run that goes on with what is in a folder, or begins in a map, or begins."""
-    source, config = ReplaySource(WORLD, outages=outages), settings(dense=dense)
+def begin(
+    out: Path, base: MapChoice | None = None, outages: Outages | None = None, *, dense: bool = False,
+    name: str = "going-on",
+) -> LiveRun:  # fmt: skip
+    """Return a run that goes on with what is in a folder, with its settings, or begins in a map, or begins."""
+    source, config = ReplaySource(WORLD, outages=outages), settings(name, dense=dense)
     if (out / "session.db").exists():
+        with closing(Session(out / "session.db")) as stored:
+            config = stored.config()  # another worker may have begun it, under a name of its own
         beginning = resumed(out, source, config)
         assert beginning is not None
     else:
