@@ -28,7 +28,7 @@ from vislam.sim.motion.spline import BodySpline
 from vislam.sim.motion.walk import walk
 from vislam.sim.scene import Painter, SceneBuilder, paint, shell, signs
 from vislam.sim.worlds.simulation import open_world
-from vislam.sim.worlds.table import WORLDS, World
+from vislam.sim.worlds.table import World
 from vislam.slam import Slam
 
 HALF_WIDTH_M, HEIGHT_M, SPEED_M_S = 1.15, 2.6, 1.0
@@ -57,8 +57,8 @@ def repeated(piece: Painter, period_m: float, seed: int) -> Painter:
     return pixels
 
 
-def add_world(name: str, length_m: float) -> None:
-    """Put a corridor into the table of simulated worlds; its walls repeat but at the ends, which are far away."""
+def corridor(name: str, length_m: float) -> World:
+    """Return a world whose walls repeat but at the ends, which are far away."""
     period_m = PERIODS[name]
 
     def build(rng: np.random.Generator) -> SceneBuilder:
@@ -78,8 +78,8 @@ def add_world(name: str, length_m: float) -> None:
         path = rounded_path([(0.0, 0.0), (length_m / 2.0, 0.1), (length_m, 0.0)], 2.0)
         return walk(path, Travel(path.length_m, SPEED_M_S, 1.0, 2.0, 1.0), int(rng.integers(0, 2**31)))
 
-    WORLDS[name] = World(f"a corridor that repeats every {period_m} m", build, motion, "rgbd", 10.0, (0.06, 0.02, 0.04),
-                         0.0)  # fmt: skip
+    words = f"a corridor that repeats every {period_m} m"
+    return World(words, build, motion, "rgbd", 10.0, (0.06, 0.02, 0.04), 0.0)
 
 
 class Darkened(WrappedRecording):
@@ -142,9 +142,7 @@ def losses_of(rng: np.random.Generator, duration_s: float, most: int) -> list[tu
 
 def run(name: str, rig: str, most: int, seed: int, length_m: float) -> list[Loss]:
     """Return what became of each loss in one world."""
-    if name not in WORLDS:
-        add_world(name, length_m)
-    world = open_world(name, seed, rig=rig, image_width_px=WIDTH_PX, workers=2)
+    world = open_world(corridor(name, length_m), seed, rig=rig, image_width_px=WIDTH_PX, workers=2)
     recording = Darkened(world, losses_of(np.random.default_rng([seed, len(name)]), world.duration_s, most))
     config = load(
         None, {"map.enabled": False, "view.enabled": False, "frontend.mode": rig, "imu.enabled": rig == "mono"}

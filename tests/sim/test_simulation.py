@@ -10,7 +10,7 @@ import pytest
 from vislam.core.camera import rectify
 from vislam.core.errors import UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
-from vislam.sim import SimOptions, Simulation, open_world
+from vislam.sim import Simulation, open_world
 
 
 def digest(world) -> str:
@@ -177,7 +177,7 @@ def test_bad_options_are_refused(options, part):
 
 
 def test_a_frame_that_does_not_exist_is_refused():
-    world = Simulation("handheld-room", 0, SimOptions(duration_s=1.0))
+    world = open_world("handheld-room", duration_s=1.0)
     for index in (-1, world.frame_count):
         with pytest.raises(UsageError, match="frames 0"):
             world.render(index)

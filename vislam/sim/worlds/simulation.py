@@ -25,7 +25,7 @@ from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.motion.spline import BodySpline
 from vislam.sim.scene import NAMES, Renderer, Scene, painted
 from vislam.sim.sensing import DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
-from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, make_rig
+from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, World, make_rig
 from vislam.trajectory import Trajectory
 
 _START_NS = 1_000_000_000_000  # not zero, so that no code can rely on it
@@ -78,29 +78,27 @@ class TrueStates:
     accel_bias_m_s2: Array  # [N, 3]
 
 
-def open_world(name: str, seed: int = 0, **options: object) -> Simulation:
-    """Open a simulated world by name.
+def open_world(world: str | World, seed: int = 0, **options: object) -> Simulation:
+    """Open a simulated world, by the name of one of the table or as one of one's own.
 
     Raises UsageError for an unknown world, and for an unknown or ill-typed option (see `SimOptions`).
     """
-    if name not in WORLDS:
-        raise UsageError(f"no simulated world '{name}'; there are: {', '.join(WORLD_NAMES)}")
-    return Simulation(name, seed, validated(SimOptions, options, f"simulated world '{name}'"))
+    if isinstance(world, str) and world not in WORLDS:
+        raise UsageError(f"no simulated world '{world}'; there are: {', '.join(WORLD_NAMES)}")
+    name, built = (world, WORLDS[world]) if isinstance(world, str) else (world.description, world)
+    return Simulation(name, built, seed, validated(SimOptions, options, f"simulated world '{name}'"))
 
 
 class Simulation:
     """A recording of a simulated world (see `vislam.core.recording.Recording`); the same bytes each time."""
 
-    def __init__(self, name: str, seed: int = 0, options: SimOptions | None = None) -> None:
+    def __init__(self, name: str, world: World, seed: int, options: SimOptions) -> None:
         """Prepare motion and inertial data; the world is painted when the first frame is asked for.
 
         Raises UsageError when `duration_s` is longer than the world's motion.
         """
         self.name = name
-        self.options = options = options or SimOptions()
-        world = WORLDS[name]
-        self._seed = seed
-        self._world = world
+        self.options, self._world, self._seed = options, world, seed
         motion_seed, imu_seed, mag_seed, exposure_seed = np.random.SeedSequence(seed).spawn(4)
         self.spline: BodySpline = world.motion(np.random.default_rng(motion_seed))
         whole_s = self.spline.duration_s

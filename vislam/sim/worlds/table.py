@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -52,7 +53,7 @@ class World:
     sensors: Sensors = Sensors()
 
 
-WORLDS: dict[str, World] = {
+WORLDS: Mapping[str, World] = MappingProxyType({
     "workshop-cart": World(
         "a cart drives two laps through a furnished workshop of 13 x 9 m: 73 s, RGB-D, many loops",
         hall.build, hall.motion, "rgbd", 15.0, (0.14, 0.03, 0.22), 4.0,
@@ -73,7 +74,7 @@ WORLDS: dict[str, World] = {
         "a cart drives 105 m through the same workshop, with stops: one webcam 0.6 m above the floor, a GY-85",
         hall.build, hall.cart_drive, "mono", 15.0, (0.2, 0.02, 0.3), 18.0, _CART,
     ),
-}  # fmt: skip
+})  # fmt: skip
 
 WORLD_NAMES: tuple[str, ...] = tuple(WORLDS)
 
