@@ -500,6 +500,48 @@ def test_hole_of_one_second_in_the_imu(scene: Scene) -> None:
     assert error @ np.linalg.solve(a.covariance[6:9, 6:9], error) < 16.0
 
 
+def test_what_a_hole_was_filled_with_is_taken_back_when_samples_come_late(scene: Scene) -> None:
+    """Half a second without samples, in which frames go on: they hold the pose, and nothing is left of it."""
+    known = [s for s in scene.samples if s.t_ns <= T0_NS + 2 * NS]
+    late, on_time = scene.ekf(), scene.ekf()
+    frames = [i for i, t_ns in enumerate(scene.stamps) if t_ns < T0_NS + 2.5 * NS]
+    for s in known:
+        late.predict(s)
+    for i in frames:
+        scene.measure(late, i)
+        late.assume(scene.stamps[i])
+    end = scene.stamps[frames[-1]]
+    state = late.state()
+    assert state.t_ns == end
+    off_m = np.linalg.norm(state.T_world_body[:3, 3] - scene.motion.pose((end - T0_NS) / NS)[:3, 3])
+    assert off_m < min(0.05, 3.0 * np.sqrt(np.trace(state.covariance[3:6, 3:6])))
+    for s in scene.samples[:800]:
+        on_time.predict(s)
+    for i in frames:
+        scene.measure(on_time, i)
+    for s in scene.samples[len(known) : 800]:
+        late.predict(s)
+    assert_same(late.state(), on_time.state())
+
+
+def test_samples_older_than_what_is_remembered_do_not_come_between(scene: Scene) -> None:
+    ekf = scene.ekf(history_s=0.5)
+    known = [s for s in scene.samples if s.t_ns <= T0_NS + NS]
+    for s in known:
+        ekf.predict(s)
+    for i in range(59):
+        scene.measure(ekf, i)
+        ekf.assume(scene.stamps[i])
+    before = ekf.state()
+    for s in scene.samples[len(known) : len(known) + 100]:  # half a second of them, more than a second late
+        ekf.predict(s)
+    assert_same(before, ekf.state())
+    for s in scene.samples[-300:]:
+        ekf.predict(s)
+    assert ekf.state().t_ns == scene.samples[-1].t_ns
+    assert np.linalg.eigvalsh(ekf.state().covariance)[0] > 0.0
+
+
 def test_bad_samples_change_nothing_but_counters(scene: Scene) -> None:
     clean, dirty = scene.ekf(), scene.ekf()
     for k, s in enumerate(scene.samples[:400]):

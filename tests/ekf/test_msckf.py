@@ -290,6 +290,27 @@ def test_the_configuration_chooses_the_filter() -> None:
     assert isinstance(loose, Ekf) and isinstance(tight, MsckfEkf)
 
 
+def test_one_camera_goes_on_while_no_inertial_sample_comes() -> None:
+    """A second without samples: frames wait for them as long as they may, then the pose follows the image alone."""
+    world = open_points("laps", 3, rig="mono", duration_s=10.0)
+    config = load(None, {"map.enabled": False})
+    front = Front(config, world.rig, world.imu_noise, StageClock())
+    begin_ns = next(value.t_ns for value in world.events() if isinstance(value, Frame)) + 7 * NS
+    heard = (v for v in world.events() if isinstance(v, Frame) or not begin_ns < v.t_ns < begin_ns + NS)
+    truth, steps_m = world.truth(), []
+    before = None
+    for step in odometry(front, heard):
+        if step.estimate is not None:
+            now = step.estimate.T_odom_body, truth.at(step.frame.t_ns)
+            if before is not None and step.frame.t_ns > begin_ns - NS:
+                steps_m.append(abs(np.linalg.norm(now[0][:3, 3] - before[0][:3, 3])
+                                   - np.linalg.norm(now[1][:3, 3] - before[1][:3, 3])))  # fmt: skip
+            before = now
+    print(f"seed 3, largest error of a step {max(steps_m):.3f} m")
+    assert len(steps_m) > 55
+    assert max(steps_m) < 0.03
+
+
 @pytest.mark.data
 def test_real_recording_with_one_camera(data_root) -> None:  # type: ignore[no-untyped-def]
     """8 s of EuRoC MH_01 after its start from rest or motion, one camera: causal poses against motion capture."""

@@ -40,10 +40,12 @@ class Correction:
         return _correction, (self.t_ns, motion, seen, *others)
 
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
-        """Give everything to a filter; return what it made of the motion."""
+        """Give everything to a filter; return what it made of the motion at once."""
         if self.noise is not None:  # it is of before the frame, and what is replayed once only goes ahead
             ekf.follow_noise(self.noise.t_ns, self.noise.scale)
-        return ekf.correct(self)
+        answer = ekf.correct(self)
+        ekf.assume(self.t_ns)  # a frame does not wait for ever: no sample comes
+        return answer
 
 
 def _plain(value: Any) -> Any:

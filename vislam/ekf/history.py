@@ -138,6 +138,11 @@ class History(Generic[S, M]):
             self.checkpoints.pop()
         return self.checkpoints[-1]
 
+    def back_to(self, t_ns: int) -> Checkpoint[S]:
+        """Drop the checkpoints after a time, not the oldest; return the newest that is left."""
+        del self.checkpoints[max(bisect_right(self.checkpoints, t_ns, key=_stamp), 1) :]
+        return self.checkpoints[-1]
+
     def forget_before(self, t_ns: int) -> list[Event[M]]:
         """Drop what is not needed to go back to `t_ns` or later and return the events of it; one checkpoint stays."""
         keep = max(bisect_right(self.checkpoints, t_ns, key=_stamp) - 1, 0)

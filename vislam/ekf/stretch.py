@@ -11,6 +11,8 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.imu import ImuSeries
 
+_ALL = 1 << 62  # ns, after every sample
+
 
 class Stretch(NamedTuple):
     """The samples from one time to another, both ends interpolated."""
@@ -22,13 +24,18 @@ class Stretch(NamedTuple):
     end: int
 
 
-def stretch(series: ImuSeries, t0_ns: int, t1_ns: int, max_gap_ns: int) -> Stretch:
-    """Return the samples between two times; a step longer than `max_gap_ns` is a hole. The series is not empty."""
-    return _stretch(series.t_ns, series.values, t0_ns, t1_ns, max_gap_ns)
+def stretch(series: ImuSeries, t0_ns: int, t1_ns: int, max_gap_ns: int, known_ns: int = _ALL) -> Stretch:
+    """Return the samples between two times. The series is not empty.
+
+    A step longer than `max_gap_ns` is a hole, and so is what comes after `known_ns`: samples there are assumed.
+    """
+    return _stretch(series.t_ns, series.values, t0_ns, t1_ns, max_gap_ns, known_ns)
 
 
 @njit(cache=True, nogil=True)
-def _stretch(times: NDArray[np.int64], values: Array, t0_ns: int, t1_ns: int, max_gap_ns: int) -> Stretch:
+def _stretch(
+    times: NDArray[np.int64], values: Array, t0_ns: int, t1_ns: int, max_gap_ns: int, known_ns: int
+) -> Stretch:
     begin, end = int(np.searchsorted(times, t0_ns, side="right")), int(np.searchsorted(times, t1_ns))
     n = end - begin + 2
     stamps, samples, gaps_s = np.empty(n, dtype=np.int64), np.empty((n, 6)), np.zeros(n)
@@ -41,7 +48,7 @@ def _stretch(times: NDArray[np.int64], values: Array, t0_ns: int, t1_ns: int, ma
     if len(neighbours) != n:  # the state is older than every sample, or newer
         neighbours = stamps
     for k in range(1, n):
-        hole_ns = neighbours[k] - neighbours[k - 1]
+        hole_ns = neighbours[k] - neighbours[k - 1] if stamps[k] <= known_ns else stamps[k] - known_ns
         gaps_s[k] = hole_ns * 1e-9 if hole_ns > max_gap_ns else 0.0
     return Stretch(stamps, samples, gaps_s, begin, end)
 

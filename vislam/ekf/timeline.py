@@ -13,6 +13,7 @@ from typing import Generic
 
 import numpy as np
 
+from vislam.config import MachineConfig
 from vislam.core.geometry import interpolate
 from vislam.core.messages import Array, ImuSample, NavState, NoiseScale
 from vislam.ekf.filter_core import Core, S
@@ -23,6 +24,7 @@ from vislam.imu import ImuSeries
 
 _CHECKPOINT_S = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
 _NS = 1_000_000_000
+_HABIT_S = 0.5  # in which an acceleration that nothing measures fades away
 _WAITS = "waits for an inertial sample as new"
 
 
@@ -41,16 +43,17 @@ class Timeline(Generic[S, M]):
     Until it is begun, samples are only kept; a state in the past is then brought to the present through them.
     """
 
-    def __init__(self, core: Core[S, M], state: S, history_s: float, max_gap_s: float) -> None:
-        """Set up an uninitialised filter; holes in the samples longer than `max_gap_s` are bridged and counted."""
+    def __init__(self, core: Core[S, M], state: S, history_s: float, machine: MachineConfig) -> None:
+        """Set up an uninitialised filter; holes in the samples of more than `max_gap_s` are bridged and counted."""
         self._core = core
         self._state = state
         self._checkpoint_ns = round(_CHECKPOINT_S * _NS)
         self._history_ns = round(history_s * _NS)
-        self._max_gap_ns = round(max_gap_s * _NS)
-        self._series = ImuSeries(10, max_gap_s)  # beside each sample, x[:10] as of the last run through it
+        self._max_gap_ns, self._gravity_m_s2 = round(machine.max_gap_s * _NS), float(machine.gravity_m_s2)
+        self._series = ImuSeries(10, machine.max_gap_s)  # beside each sample, x[:10] as of the last run through it
         self._history: History[S, M] | None = None
         self._t_ns = 0
+        self._known_ns: int | None = None  # of the last sample, where later ones are assumed
         self._applied = 0
         self._stops_at_event = False  # see `replayed_once`
         self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *core.counters), 0)
@@ -85,16 +88,21 @@ class Timeline(Generic[S, M]):
     def predict(self, sample: ImuSample) -> None:
         """Take a sample and bring the state to its time.
 
-        Samples that are no measurement of a new time, see `StreamJudge`, are counted and change nothing.
+        Samples that are no measurement of a new time, see `StreamJudge`, are counted and change nothing. What was
+        assumed before it, see `assume`, is taken back.
         """
-        before = self._series.newest_t_ns
-        if not self._series.append(sample):
+        before, history = self._newest_known_ns, self._history
+        oldest = None if self._known_ns is None or history is None else history.checkpoints[0].t_ns
+        kept_ns = None if oldest is None else max(oldest, self._known_ns or oldest)
+        if not self._series.append(sample, kept_ns):
             return
         self._counts["imu_samples"] += 1
+        if kept_ns is not None and history is not None:
+            self._known_ns = None
+            self._restore(history.back_to(kept_ns))
         dt_ns = 0 if before is None else sample.t_ns - before
         if dt_ns > self._max_gap_ns:
             self._counts["imu_gaps"] += 1
-        history = self._history
         if history is None:
             if sample.t_ns - int(self._series.t_ns[0]) > 2 * self._history_ns:
                 self._series.forget_before(sample.t_ns - self._history_ns)
@@ -108,6 +116,29 @@ class Timeline(Generic[S, M]):
         self._t_ns = sample.t_ns
         if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
             self._take_checkpoint()
+
+    def assume(self, t_ns: int) -> None:
+        """Take the newest sample for one at a frame that none reaches, as unsure as in a hole, and apply what waits.
+
+        When samples come again they say what happened meanwhile, as far back as the history reaches.
+        """
+        known_ns, history = self._newest_known_ns, self._history
+        if known_ns is None or history is None:
+            return
+        number = self._applied
+        while (event := history.event(number)) is not None and event.t_ns <= t_ns:
+            t_ns, number = max(t_ns, self._core.time_of(event, self._state)), number + 1
+        if t_ns > (self._series.newest_t_ns or t_ns):
+            self._known_ns = known_ns
+            self._series.assume(t_ns, self._fading(t_ns))
+            self._run()
+
+    def _fading(self, t_ns: int) -> Array:
+        """Return the sample [6] of a motion that fades into a uniform one: nobody turns or speeds up for long."""
+        x, share = self._state.x, float(np.exp((self._t_ns - t_ns) / _NS / _HABIT_S))
+        force = pose(x, 0, 6)[2, :3] * self._gravity_m_s2 + x[10:13]
+        uniform = np.concatenate([x[13:16], force])
+        return uniform + share * (self._series.values[-1] - uniform)
 
     @contextmanager
     def replayed_once(self) -> Iterator[None]:
@@ -205,6 +236,10 @@ class Timeline(Generic[S, M]):
             return UpdateResult(False, float("nan"), _WAITS)
         return UpdateResult(outcome.accepted, outcome.nis, outcome.reason)
 
+    @property
+    def _newest_known_ns(self) -> int | None:
+        return self._series.newest_t_ns if self._known_ns is None else self._known_ns
+
     def _run(self, until_ns: int | None = None) -> None:
         """Go on from the present state through every sample and event that is here, or until a time."""
         history = self._history
@@ -236,7 +271,7 @@ class Timeline(Generic[S, M]):
     def _integrate(self, state: S, t0_ns: int, t1_ns: int, keep: bool = False) -> None:
         if t1_ns <= t0_ns:
             return
-        piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns)
+        piece = stretch(self._series, t0_ns, t1_ns, self._max_gap_ns, self._known_ns or t1_ns)
         track = np.empty((len(piece.t_ns), 10))
         self._core.run(state, piece, track)
         if keep:

@@ -62,11 +62,23 @@ class ImuSeries:
         """Time of the newest sample, None when there is none yet."""
         return self._newest_t_ns if self._end > self._begin else None
 
-    def append(self, sample: ImuSample) -> bool:
-        """Take a sample if the judge does; return whether."""
+    def append(self, sample: ImuSample, after_ns: int | None = None) -> bool:
+        """Take a sample if the judge does, in place of those that were assumed after a time; return whether."""
         t_ns, six = sample.t_ns, [*sample.gyro_rad_s.tolist(), *sample.accel_m_s2.tolist()]
         if not self.judge.takes(t_ns, six):
             return False
+        if after_ns is not None:
+            if t_ns <= after_ns:  # too late: what was assumed there stays
+                return False
+            self._end = self._begin + int(np.searchsorted(self.t_ns, after_ns, side="right"))
+        self._put(t_ns, six)
+        return True
+
+    def assume(self, t_ns: int, six: Array) -> None:
+        """Put values [6] where no sample has come, after all others."""
+        self._put(t_ns, six.tolist())
+
+    def _put(self, t_ns: int, six: list[float]) -> None:
         if self._end == len(self._t_ns):
             self._make_room()
         self._values[self._end] = six
@@ -74,7 +86,6 @@ class ImuSeries:
         self._t_ns[self._end] = t_ns
         self._newest_t_ns = t_ns
         self._end += 1
-        return True
 
     def forget_before(self, t_ns: int) -> int:
         """Drop samples not needed to interpolate at or after `t_ns`; return how many went."""

@@ -53,7 +53,7 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
             suite: sensors other than IMU and camera; None: there are none.
         """
         self._loose = LooseCore(config, noise, machine, T_body_camera, suite)
-        super().__init__(self._loose, self._loose.blank(), config.history_s, machine.max_gap_s)
+        super().__init__(self._loose, self._loose.blank(), config.history_s, machine)
 
     @classmethod
     def at_rest(

@@ -49,7 +49,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         self._rig = rig
         self._readout_s = config.tight_readout_s or 0.0
         self._tight = TightCore(config, noise, float(machine.gravity_m_s2), rig, suite)
-        super().__init__(self._tight, self._tight.blank(), config.tight_history_s, machine.max_gap_s)
+        super().__init__(self._tight, self._tight.blank(), config.tight_history_s, machine)
 
     @property
     def calibration(self) -> CameraCalibration:
