@@ -7,13 +7,13 @@ are those of https://design.ros2.org/articles/topic_and_service_names.html and o
 """
 
 import time
-from dataclasses import dataclass
+from typing import Any
 
 import cyclonedds.idl.annotations as annotate
 import numpy as np
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint32
 from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.topic import Topic
@@ -38,135 +38,28 @@ QOS = Qos(
 )
 
 
-@dataclass
-@annotate.final
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """When."""
-
-    sec: int32
-    nanosec: uint32
+def _message(package: str, name: str, **fields: Any) -> Any:
+    """Return the class of a ROS message."""
+    return annotate.final(make_idl_struct(name, f"{package}::msg::dds_::{name}_", fields))
 
 
-@dataclass
-@annotate.final
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """When and in which frame."""
-
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-@annotate.final
-class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
-    """A position."""
-
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-@annotate.final
-class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
-    """A direction."""
-
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-@annotate.final
-class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
-    """A rotation."""
-
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-
-@dataclass
-@annotate.final
-class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
-    """Where."""
-
-    position: Point
-    orientation: Quaternion
-
-
-@dataclass
-@annotate.final
-class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
-    """Where, and how sure; rows of x, y, z, rotation about X, Y, Z, in axes of the header's frame."""
-
-    pose: Pose
-    covariance: array[float64, 36]
-
-
-@dataclass
-@annotate.final
-class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
-    """How fast."""
-
-    linear: Vector3
-    angular: Vector3
-
-
-@dataclass
-@annotate.final
-class TwistWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::TwistWithCovariance_"):
-    """How fast, and how sure; in axes of the child's frame."""
-
-    twist: Twist
-    covariance: array[float64, 36]
-
-
-@dataclass
-@annotate.final
-class Odometry(IdlStruct, typename="nav_msgs::msg::dds_::Odometry_"):
-    """nav_msgs/Odometry."""
-
-    header: Header
-    child_frame_id: str
-    pose: PoseWithCovariance
-    twist: TwistWithCovariance
-
-
-@dataclass
-@annotate.final
-class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
-    """T_a_b."""
-
-    translation: Vector3
-    rotation: Quaternion
-
-
-@dataclass
-@annotate.final
-class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformStamped_"):
-    """T_a_b: a is the header's frame, b the child's."""
-
-    header: Header
-    child_frame_id: str
-    transform: Transform
-
-
-@dataclass
-@annotate.final
-class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
-    """What goes over /tf."""
-
-    transforms: sequence[TransformStamped]
-
-
-@dataclass
-@annotate.final
-class UInt32(IdlStruct, typename="std_msgs::msg::dds_::UInt32_"):
-    """std_msgs/UInt32: the health word, of which an Odometry has no field."""
-
-    data: uint32
+Time = _message("builtin_interfaces", "Time", sec=int32, nanosec=uint32)
+Header = _message("std_msgs", "Header", stamp=Time, frame_id=str)
+Point = _message("geometry_msgs", "Point", x=float64, y=float64, z=float64)
+Vector3 = _message("geometry_msgs", "Vector3", x=float64, y=float64, z=float64)
+Quaternion = _message("geometry_msgs", "Quaternion", x=float64, y=float64, z=float64, w=float64)
+Pose = _message("geometry_msgs", "Pose", position=Point, orientation=Quaternion)
+# rows of x, y, z, rotation about X, Y, Z: of a pose in axes of the header's frame, of a twist in those of the child's
+PoseWithCovariance = _message("geometry_msgs", "PoseWithCovariance", pose=Pose, covariance=array[float64, 36])
+Twist = _message("geometry_msgs", "Twist", linear=Vector3, angular=Vector3)
+TwistWithCovariance = _message("geometry_msgs", "TwistWithCovariance", twist=Twist, covariance=array[float64, 36])
+Odometry = _message(
+    "nav_msgs", "Odometry", header=Header, child_frame_id=str, pose=PoseWithCovariance, twist=TwistWithCovariance
+)
+Transform = _message("geometry_msgs", "Transform", translation=Vector3, rotation=Quaternion)
+TransformStamped = _message("geometry_msgs", "TransformStamped", header=Header, child_frame_id=str, transform=Transform)
+TFMessage = _message("tf2_msgs", "TFMessage", transforms=sequence[TransformStamped])
+UInt32 = _message("std_msgs", "UInt32", data=uint32)  # the health word, of which an Odometry has no field
 
 
 class Ros2:
@@ -200,8 +93,8 @@ class Ros2:
         vars(self).clear()  # an entity leaves when it is let go
 
 
-def odometry(pose: PublishedPose, stamp_ns: int) -> Odometry:
-    """Return the message: pose in `odom`, twist in `base_link`; the stamp is of CLOCK_REALTIME, as ROS's are."""
+def odometry(pose: PublishedPose, stamp_ns: int) -> Any:
+    """Return an `Odometry`: pose in `odom`, twist in `base_link`; the stamp is of CLOCK_REALTIME, as ROS's are."""
     T = pose.T_odom_base
     return Odometry(
         Header(_time(stamp_ns), "odom"),
@@ -214,8 +107,11 @@ def odometry(pose: PublishedPose, stamp_ns: int) -> Odometry:
     )
 
 
-def transforms(pose: PublishedPose, stamp_ns: int) -> TFMessage:
-    """Return odom -> base_link, which never jumps, and map -> odom, which loops correct, while the place is known."""
+def transforms(pose: PublishedPose, stamp_ns: int) -> Any:
+    """Return a `TFMessage`.
+
+    odom -> base_link, which never jumps, and map -> odom, which loops correct, while the place is known.
+    """
     frames = (("map", "odom", pose.T_map_odom), ("odom", "base_link", pose.T_odom_base))
     return TFMessage(
         [
@@ -227,9 +123,9 @@ def transforms(pose: PublishedPose, stamp_ns: int) -> TFMessage:
     )
 
 
-def _time(t_ns: int) -> Time:
+def _time(t_ns: int) -> Any:
     return Time(*divmod(t_ns, _NS))
 
 
-def _quaternion(T: Matrix) -> Quaternion:
+def _quaternion(T: Matrix) -> Any:
     return Quaternion(*quaternion_xyzw_from_rotation(T[:3, :3]).tolist())
