@@ -15,7 +15,9 @@ import psutil
 import pytest
 
 from vislam.cli import run_verb
-from vislam.cli.verbs.web_page import WebChoice, take_web
+from vislam.cli.verbs.arguments import parse
+from vislam.cli.verbs.live import ResumeOptions
+from vislam.cli.verbs.web_page import PageOptions, opened
 from vislam.core.errors import UsageError
 from vislam.live.web.address import parsed
 from vislam.live.web.station import Station
@@ -104,27 +106,32 @@ def test_commands_that_nobody_takes_are_bounded() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "left", "choice"),
+    ("given", "page"),
     [
-        (["--out", "x"], ["--out", "x"], None),
-        (["--web"], [], WebChoice("127.0.0.1:8765", (), False)),
-        (["--web", "--out", "x"], ["--out", "x"], WebChoice("127.0.0.1:8765", (), False)),
-        (["--out", "x", "--web", ":9000"], ["--out", "x"], WebChoice(":9000", (), False)),
-        (["--web=0.0.0.0:1", "--web-waits"], [], WebChoice("0.0.0.0:1", (), True)),
-        (["--web", "--web-host", "a.b", "--web-host", "c"], [], WebChoice("127.0.0.1:8765", ("a.b", "c"), False)),
+        (["--seconds", "1"], PageOptions()),
+        (["--web"], PageOptions(())),
+        (["--web", "--seconds", "1"], PageOptions(())),
+        (["--seconds", "1", "--web", ":9000"], PageOptions((":9000",))),
+        (["--web=0.0.0.0:1", "--web-waits"], PageOptions(("0.0.0.0:1",), True)),
+        (["--web", "--web-host", "a.b", "--web-host", "c"], PageOptions((), False, ("a.b", "c"))),
     ],
 )
-def test_options_of_the_page_are_taken_and_the_others_left(given, left, choice) -> None:
-    assert take_web(given) == choice
-    assert given == left
+def test_options_of_the_page_are_understood(given, page) -> None:
+    assert parse(ResumeOptions, given, "live").page == page
 
 
 @pytest.mark.parametrize(
-    "given", [["--web-waits"], ["--web-host", "a"], ["--web", "--web-host", "http://a"], ["--web", "--web-host"]]
+    "page",
+    [
+        PageOptions(None, True),
+        PageOptions(web_host=("a",)),
+        PageOptions((), False, ("http://a",)),
+        PageOptions(("a:1", "b:2")),
+    ],
 )
-def test_options_of_the_page_that_make_no_sense_are_refused(given) -> None:
-    with pytest.raises(UsageError):
-        take_web(given)
+def test_options_of_the_page_that_make_no_sense_are_refused(page, tmp_path) -> None:
+    with pytest.raises(UsageError), opened(page, "cart", tmp_path):
+        pass
 
 
 @pytest.mark.parametrize("at", ["8765", "no such:1", "no-such-host.invalid:80", "203.0.113.7:80"])

@@ -149,6 +149,9 @@ def test_usage(runs, tmp_path, capsys):
     monday, out = str(runs / "monday"), str(tmp_path / "out")
     assert run_verb(["optimize", monday, "--out", out]) == 2
     assert run_verb(["optimize", monday, monday, "--out", out]) == 2
+    assert run_verb(["optimize", monday, str(runs / "tuesday")]) == 2
+    assert "--out FOLDER" in capsys.readouterr().err
+    assert run_verb(["optimize", monday, str(runs / "tuesday"), "--out", out, "--rounds", "1"]) == 2
     assert run_verb(["optimize", monday, str(tmp_path / "nowhere"), "--out", out]) == 3
     assert "no session at" in capsys.readouterr().err
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from vislam.cli.verbs import VERBS
 from vislam.cli.verbs.brief import Brief, brief_help
@@ -14,9 +14,6 @@ from vislam.config.ranges import check_ranges
 from vislam.core.collector import while_importing
 from vislam.core.compiling import on_compilation
 from vislam.core.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
 
 Options = TypeVar("Options")
 

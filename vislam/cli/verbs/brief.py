@@ -47,7 +47,7 @@ def brief_help(verb: str, options: type, brief: Brief) -> str:
     """Return the short help of a verb, as wide as the terminal."""
     width = min(max(shutil.get_terminal_size().columns, _NARROWEST), _WIDEST)
     settings = {".".join(setting.path): setting for setting in settings_of(options)}
-    own = [setting for setting in settings.values() if setting.owner is options]
+    own = [setting for setting in settings.values() if setting.owner.__module__.startswith("vislam.cli.")]
     rest = len(settings) - len(own)
     lines = [f"usage: vislam {verb} {brief.usage}", "", VERBS[verb].summary, "", "examples:"]
     lines += [f"  {example}" for example in brief.examples]
@@ -105,6 +105,9 @@ def _left(setting: Setting) -> str:
         return setting.path[-1].upper()
     if _plain(setting.type) is bool:
         return flags[1] if setting.value is True else flags[0]
+    for extra in getattr(setting.type, "__metadata__", ()):
+        if getattr(extra, "metavar", None):
+            return f"{flags[0]} {extra.metavar}"
     choices = choices_of(setting.type)
     many = " ..." if get_origin(_plain(setting.type)) is tuple else ""
     if choices and sum(map(len, choices)) < 36:

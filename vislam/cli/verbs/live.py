@@ -14,7 +14,7 @@ from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics
 from vislam.cli.verbs.terminal import rewritten_line
-from vislam.cli.verbs.web_page import WebChoice, begun_by_page, opened, take_web
+from vislam.cli.verbs.web_page import PageOptions, begun_by_page, opened
 from vislam.config import Config, SensorsConfig, load, load_cart
 from vislam.config.ranges import Positive
 from vislam.core.errors import UsageError
@@ -47,6 +47,7 @@ class LiveOptions:
     """With --map: find the way in it, and leave its keyframes and clouds as they are"""
     json: bool = False
     """Print the metrics as JSON instead of the table"""
+    page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class ResumeOptions:
     """How long; None: until Ctrl-C, or the end of a replay"""
     json: bool = False
     """Print the metrics as JSON instead of the table"""
+    page: Annotated[PageOptions, tyro.conf.arg(name="")] = field(default_factory=PageOptions)
 
 
 OPTIONS = (LiveOptions, ResumeOptions)
@@ -65,9 +67,6 @@ TAKEN = {
     "--profile pi": "settings for a small computer; file and options go before it",
     "--sensors FILE": "TOML file of a cart's sensors, with tables [sensors.NAME] of further ones; options go before it",
     "--resume RUN": "go on with that run",
-    "--web [HOST:PORT]": "a page that shows and steers the run; 127.0.0.1:8765 where nothing else is said",
-    "--web-waits": "with --web: begin when the page says so; until then it can calibrate",
-    "--web-host NAME": "with --web: a further name that the page may be asked for by, such as that of a tunnel",
 }
 BRIEF = Brief(
     "--out RUN [options]",
@@ -90,10 +89,9 @@ BRIEF = Brief(
 def main(arguments: list[str]) -> int:
     """Run live until the time is over, the source ends or a signal comes."""
     command = ["vislam", "live", *arguments]
-    web = take_web(arguments)
     resumed = take_path(arguments, "--resume")
     if resumed is not None:
-        return _resume(resumed, arguments, command, web)
+        return _resume(resumed, arguments, command)
     settings = load(take_path(arguments, "--config"), profile_name=take_option(arguments, "--profile"))
     sensors, further = load_cart(take_path(arguments, "--sensors"))
     settings = settings if further.file is None else replace(settings, sensors=further)
@@ -102,9 +100,9 @@ def main(arguments: list[str]) -> int:
     from vislam.runs.folder import map_choice, prepare
 
     base = map_choice(options.map, options.localize_only, options.settings)
-    with opened(web, options.settings.live.name, options.out) as station:
+    with opened(options.page, options.settings.live.name, options.out) as station:
         make = partial(_made, command=command, base=base, station=station)
-        if station is not None and web is not None and web.waits:
+        if station is not None and options.page.web_waits:
             prepare(options.out, options.overwrite, base)
             (live, seconds), options = begun_by_page(station, options, command, make)
         else:
@@ -128,7 +126,7 @@ def _made(
     return live, source.duration_s if options.seconds is None else options.seconds
 
 
-def _resume(out: Path, arguments: list[str], command: list[str], web: WebChoice | None) -> int:
+def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     """Go on with the run in a folder, whatever ended it."""
     from vislam.live.beginning import in_map, resumed
     from vislam.live.run_live import LiveRun
@@ -136,7 +134,7 @@ def _resume(out: Path, arguments: list[str], command: list[str], web: WebChoice 
     from vislam.runs.folder import prepare, read_setup
 
     options = parse(ResumeOptions, arguments, "live")
-    if web is not None and web.waits:
+    if options.page.web_waits:
         raise UsageError("--web-waits is for new runs; leave it off with --resume")
     asked, config, base = read_setup(out)
     sensors = stored_sensors(out)
@@ -145,7 +143,7 @@ def _resume(out: Path, arguments: list[str], command: list[str], web: WebChoice 
     is_new = beginning is None  # there was nothing yet to go on from
     if is_new and base is not None:
         beginning = in_map(base, source, settings)
-    with opened(web, settings.live.name, out) as station:
+    with opened(options.page, settings.live.name, out) as station:
         ends = None if station is None else station.ends
         live = LiveRun(source, settings, out, asked, command, base, beginning, ends)
         if is_new:

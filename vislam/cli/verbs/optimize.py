@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
@@ -16,67 +15,64 @@ from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.results import print_evaluation
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import BatchConfig
-from vislam.core.errors import TrackingLostError, printable
+from vislam.core.errors import TrackingLostError, UsageError, printable
 from vislam.core.log import log_in_run, log_to
 
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """Options of `vislam optimize RUN`; several RUNs have their own."""
+    """Options of `vislam optimize RUN`, and of several RUNs, joined into one pose graph by loops between them."""
 
-    run: Positional[Path]
-    """Run folder, whether its run came to the end or not; give several before --help for their options"""
+    runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """Run folder, whether its run came to the end or not; several, or session.db files, are joined, only read, and the
+    map is that of the first"""
     settings: Annotated[BatchConfig, tyro.conf.arg(name="")] = field(default_factory=BatchConfig)
+    out: Path | None = None
+    """Of several: folder for trajectory_NAME.tum of each, joined.g2o, loops.csv, summary.json and report.html"""
     out_name: str = "batch"
-    """Names the files: trajectory_NAME.tum, states_NAME.csv"""
-    json: bool = False
-    """Print the entry of metrics.json instead of the summary"""
-
-
-@dataclass(frozen=True)
-class JoinOptions:
-    """Options of `vislam optimize RUN RUN [...]`: sessions joined into one pose graph by loops between them."""
-
-    out: Path
-    """Folder for trajectory_NAME.tum of each session, joined.g2o, loops.csv, summary.json and report.html"""
-    sessions: Positional[tuple[Path, ...]] = ()
-    """Run folders or session.db files, two or more, which are only read; the map is that of the first"""
+    """Of one: names the files trajectory_NAME.tum, states_NAME.csv"""
     report: bool = True
     """Write report.html, with pictures of before and after"""
     json: bool = False
-    """Print summary.json instead of the summary"""
+    """Print what is written, the entry of metrics.json or summary.json, instead of the summary"""
 
 
-OPTIONS = (OptimizeOptions, JoinOptions)
+OPTIONS = (OptimizeOptions,)
 
 
 def main(arguments: list[str]) -> int:
     """Optimise what the arguments name: a run or several; a pose-graph file is handed on to its own verb."""
     command = ["vislam", "optimize", *arguments]
-    folders = [a for a in takewhile(lambda a: not a.startswith("-"), arguments) if Path(a).is_dir()]
-    sessions = [a for a in arguments if (Path(a) / "session.db").is_file() or Path(a).name == "session.db"]
-    has_out = any(a.partition("=")[0] == "--out" for a in arguments)
-    if len(folders) > 1 or len(sessions) > 1 or ((folders or sessions) and has_out):
-        join = parse(JoinOptions, arguments, "optimize")
-        with log_to(join.out, command):
-            return _join_sessions(join)
-    if any(_is_graph(Path(argument)) for argument in arguments):
+    if _name_a_graph([Path(argument) for argument in arguments]):
         return posegraph.main(arguments)
     options = parse(OptimizeOptions, arguments, "optimize")
-    with log_in_run(options.run, command):
-        return _optimize_run(options)
+    if options.out is None:
+        if len(options.runs) != 1:
+            raise UsageError("give one RUN, or several and the folder that they are joined in: --out FOLDER")
+        with log_in_run(options.runs[0], command):
+            return _optimize_run(options, options.runs[0])
+    if (options.settings, options.out_name) != (BatchConfig(), "batch"):
+        raise UsageError(
+            "with --out runs are joined, and options of a single run's batch change nothing; leave them off"
+        )
+    with log_to(options.out, command):
+        return _join_sessions(options, options.out)
 
 
-def _is_graph(path: Path) -> bool:
-    return path.suffix in (".g2o", ".toro", ".isam") or (path.exists() and not path.is_dir())
+def _name_a_graph(paths: list[Path]) -> bool:
+    """Return whether a pose-graph file was typed: by its ending, or as what comes first of all that exists."""
+    first = next((path for path in paths if path.exists()), None)
+    is_file = first is not None and first.is_file() and first.name != "session.db"
+    return is_file or any(path.suffix in (".g2o", ".toro", ".isam") for path in paths)
 
 
-def _optimize_run(options: OptimizeOptions) -> int:
+def _optimize_run(options: OptimizeOptions, run: Path) -> int:
     from vislam.runs.offline.optimize_run import optimize
     from vislam.runs.report import write_report
 
-    entry = optimize(options.run, options.settings, options.out_name)
-    write_report(options.run)
+    entry = optimize(run, options.settings, options.out_name)
+    if options.report:
+        write_report(run)
     if options.json:
         print(json.dumps(entry))
         return 0
@@ -91,21 +87,21 @@ def _optimize_run(options: OptimizeOptions) -> int:
         print(f"warning: {printable(warning)}")
     if entry["accuracy"]:
         print_evaluation({f"{options.out_name} ({mode})": entry["accuracy"][mode] for mode in entry["accuracy"]})
-    print(f"trajectory: {options.run / f'trajectory_{options.out_name}.tum'}")
+    print(f"trajectory: {run / f'trajectory_{options.out_name}.tum'}")
     return 0
 
 
-def _join_sessions(options: JoinOptions) -> int:
+def _join_sessions(options: OptimizeOptions, out: Path) -> int:
     from vislam.runs.folder import check_writable
     from vislam.runs.offline.join_sessions import join_sessions, write_joined
     from vislam.runs.report.graph_page import write_graph_report
 
-    check_writable(options.out)  # before the work, which may take minutes
+    check_writable(out)  # before the work, which may take minutes
     with progress_bar("loops between sessions", "keyframes") as bar:
-        joined = join_sessions(options.sessions, progress=bar)
-    write_joined(joined, options.out)
+        joined = join_sessions(options.runs, progress=bar)
+    write_joined(joined, out)
     if options.report:
-        write_graph_report(joined.problem, joined.solution, " + ".join(joined.names), options.out / "report.html")
+        write_graph_report(joined.problem, joined.solution, " + ".join(joined.names), out / "report.html")
     summary = joined.summary
     if options.json:
         print(json.dumps(summary))
@@ -116,5 +112,5 @@ def _join_sessions(options: JoinOptions) -> int:
         )
         for warning in summary["warnings"]:
             print(f"warning: {printable(warning)}")
-        print(f"results: {options.out}")
+        print(f"results: {out}")
     return 0 if summary["converged"] else TrackingLostError.exit_code

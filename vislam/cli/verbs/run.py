@@ -64,7 +64,7 @@ BRIEF = Brief(
         "vislam run PATH --out runs/next --map runs/hall",
         "vislam run --resume runs/hall",
     ),
-    (*COMMON, "ekf.graph_feedback", "graph.coupling", "loop.inject_share", "loop.start_in_map", "init.time_offset_s"),
+    (*COMMON, "ekf.graph_feedback", "graph.coupling", "loop.start_in_map", "init.time_offset_s"),
     TAKEN,
 )
 

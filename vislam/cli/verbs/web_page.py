@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
-from vislam.cli.verbs.arguments import take_option
+import tyro
+from tyro.conf import UseAppendAction
+
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.log import log_to
 
@@ -20,55 +22,37 @@ if TYPE_CHECKING:
 Made = TypeVar("Made")
 
 
-@dataclass(frozen=True, slots=True)
-class WebChoice:
-    """What was asked for: where the page listens, names beside its own, and whether the run waits for it."""
+@dataclass(frozen=True)
+class PageOptions:
+    """Options of the page: where it listens, names beside its own, and whether the run waits for it."""
 
-    at: str
-    hosts: tuple[str, ...]
-    waits: bool
-
-
-def take_web(arguments: list[str]) -> WebChoice | None:
-    """Remove `--web [HOST:PORT]`, `--web-waits` and `--web-host NAME` from the arguments; None without --web.
-
-    Raises UsageError for the others without it, and for what is no name.
-    """
-    from vislam.live.web.address import DEFAULT, is_name
-
-    hosts = []
-    while (name := take_option(arguments, "--web-host")) is not None:
-        if not is_name(name):
-            raise UsageError(f"--web-host '{name}' is no name of a host; write it without scheme and port")
-        hosts.append(name)
-    waits = "--web-waits" in arguments
-    while "--web-waits" in arguments:
-        arguments.remove("--web-waits")
-    at: str | None = None
-    for i, argument in enumerate(arguments):
-        name, equals, given = argument.partition("=")
-        if name != "--web":
-            continue
-        follows = not equals and i + 1 < len(arguments) and not arguments[i + 1].startswith("-")
-        at = given if equals else arguments[i + 1] if follows else DEFAULT
-        del arguments[i : i + 1 + follows]
-        break
-    if at is None and (hosts or waits):
-        raise UsageError("--web-waits and --web-host are options of the page; add --web")
-    return None if at is None else WebChoice(at, tuple(hosts), waits)
+    web: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[HOST:PORT]")] = None
+    """A page that shows and steers the run; 127.0.0.1:8765 where nothing else is said"""
+    web_waits: bool = False
+    """With --web: begin when the page says so; until then it can calibrate"""
+    web_host: Annotated[UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
+    """With --web: a further name that the page may be asked for by, such as that of a tunnel"""
 
 
 @contextmanager
-def opened(web: WebChoice | None, pose_name: str, out: Path) -> Iterator[Station | None]:
-    """Serve the page meanwhile, and say where; None where none was asked for."""
-    if web is None:
+def opened(page: PageOptions, pose_name: str, out: Path) -> Iterator[Station | None]:
+    """Serve the page meanwhile, and say where; None where none was asked for.
+
+    Raises UsageError for other options of the page without --web, and for what is no name or address.
+    """
+    if page.web is None:
+        if page.web_waits or page.web_host:
+            raise UsageError("--web-waits and --web-host are options of the page; add --web")
         yield None
         return
-    from vislam.live.web.address import parsed
+    from vislam.live.web.address import DEFAULT, is_name, parsed
     from vislam.live.web.station import Station
 
-    at = parsed(web.at)
-    station = Station(at, web.hosts, pose_name, out)
+    for name in page.web_host:
+        if not is_name(name):
+            raise UsageError(f"--web-host '{name}' is no name of a host; write it without scheme and port")
+    at = parsed(" ".join(page.web) or DEFAULT)
+    station = Station(at, page.web_host, pose_name, out)
     try:
         print(f"vislam: the page of this run: {station.url}", file=sys.stderr, flush=True)
         if not at.is_loopback:
