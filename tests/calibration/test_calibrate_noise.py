@@ -31,6 +31,11 @@ def test_the_deviation_is_that_of_its_definition() -> None:
         assert deviation == pytest.approx(np.sqrt(0.5 * np.mean((means[m:] - means[:-m]) ** 2)))
 
 
+def test_the_curve_that_is_drawn_is_the_one_that_was_measured() -> None:
+    curve = allan_curve(axis(0, 0.03, 0.03), 50.0)
+    assert fit_noise(curve).deviation(curve.tau_s[:10]) == pytest.approx(curve.deviation[:10], rel=0.2)
+
+
 def test_errors_are_as_large_as_their_sigmas() -> None:
     white, walk = [], []
     for seed in range(40):
