@@ -13,6 +13,7 @@ from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, Lo
 from vislam.loop.closer import LoopCloser
 from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, make_rig, room
 
+Laps = tuple[LandmarkWorld, list[Array], list[Keyframe]]
 PER_LAP = 40
 CONFIG = replace(LoopConfig(), appearance_skip_keyframes=12, appearance_skip_s=1.0)
 
@@ -46,12 +47,12 @@ def worst_error(edges: list[LoopEdge], poses: list[Array]) -> tuple[float, float
 
 
 @pytest.fixture(scope="module")
-def laps() -> tuple[LandmarkWorld, list[Array], list[Keyframe]]:
+def laps() -> Laps:
     world, rng, poses = room(1), np.random.default_rng(0), lap_poses(2.0, PER_LAP)
     return world, poses, [world.see(i, pose, rng) for i, pose in enumerate(poses)]
 
 
-def test_the_second_lap_closes_on_the_first(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
+def test_the_second_lap_closes_on_the_first(laps: Laps) -> None:
     world, poses, keyframes = laps
     edges, candidates = run(
         LoopCloser(CONFIG, world.rig, 0, gravity_aligned=True), keyframes, drifting(poses, 1, 0.01, 0.2)
@@ -67,9 +68,7 @@ def test_the_second_lap_closes_on_the_first(laps: tuple[LandmarkWorld, list[Arra
     assert [(c.from_id, c.to_id) for c in accepted] == [(e.from_id, e.to_id) for e in edges]
 
 
-def test_appearance_closes_loops_where_odometry_is_lost(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_appearance_closes_loops_where_odometry_is_lost(laps: Laps) -> None:
     """The second lap's estimate is off by 40 m, so the map's poses suggest nothing; appearance alone must do it."""
     world, poses, keyframes = laps
     away = np.eye(4)
@@ -86,9 +85,7 @@ def test_appearance_closes_loops_where_odometry_is_lost(
     assert len(persistent) > PER_LAP // 2
 
 
-def test_every_candidate_has_a_decision_and_a_reason(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_every_candidate_has_a_decision_and_a_reason(laps: Laps) -> None:
     world, poses, keyframes = laps
     detector = LoopCloser(replace(CONFIG, min_rigid=0), world.rig, 0)  # what is not alike is verified, too
     _, candidates = run(detector, keyframes, poses)
@@ -102,7 +99,7 @@ def test_every_candidate_has_a_decision_and_a_reason(
     assert max(per_keyframe.values()) <= CONFIG.max_verifications
 
 
-def test_two_runs_give_the_same_bytes(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
+def test_two_runs_give_the_same_bytes(laps: Laps) -> None:
     world, poses, keyframes = laps
     runs = []
     for _ in range(2):
@@ -117,9 +114,7 @@ def test_two_runs_give_the_same_bytes(laps: tuple[LandmarkWorld, list[Array], li
     assert runs[0] == runs[1]
 
 
-def test_the_vocabulary_is_trained_again_as_the_run_grows(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_the_vocabulary_is_trained_again_as_the_run_grows(laps: Laps) -> None:
     world, poses, keyframes = laps
     detector, changes, last = LoopCloser(CONFIG, world.rig, 0), [], None
     for keyframe, pose in zip(keyframes, poses, strict=True):
@@ -158,9 +153,7 @@ def test_a_tilted_copy_of_a_place_contradicts_gravity() -> None:
     assert [c for c in candidates if "off gravity" in c.reason]
 
 
-def test_what_nothing_speaks_against_is_offered_at_once(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_what_nothing_speaks_against_is_offered_at_once(laps: Laps) -> None:
     """The first keyframe that sees an old place offers its loops, however far off odometry is: the graph decides."""
     world, poses, keyframes = laps
     away = np.eye(4)
@@ -174,7 +167,7 @@ def test_what_nothing_speaks_against_is_offered_at_once(
     assert [(c.from_id, c.to_id) for c in sound] == [(e.from_id, e.to_id) for e in edges]
 
 
-def test_a_map_that_moves_is_followed(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
+def test_a_map_that_moves_is_followed(laps: Laps) -> None:
     """The old keyframes were 40 m off; once the graph has moved them, odometry finds them again."""
     world, poses, keyframes = laps
     away = np.eye(4)
@@ -207,7 +200,7 @@ def test_without_depth_edges_have_no_scale() -> None:
     assert all("direction good to" in reason for reason in accepted)
 
 
-def test_poor_keyframes_do_no_harm(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
+def test_poor_keyframes_do_no_harm(laps: Laps) -> None:
     """Without features, with NaN everywhere, without any point: recorded at most, never a traceback."""
     world, poses, keyframes = laps
     bad = keyframes[5]
@@ -223,7 +216,7 @@ def test_poor_keyframes_do_no_harm(laps: tuple[LandmarkWorld, list[Array], list[
     assert all(np.all(np.isfinite(edge.T_from_to)) for edge in edges)
 
 
-def test_switched_off_it_does_nothing(laps: tuple[LandmarkWorld, list[Array], list[Keyframe]]) -> None:
+def test_switched_off_it_does_nothing(laps: Laps) -> None:
     world, poses, keyframes = laps
     edges, candidates = run(LoopCloser(replace(CONFIG, enabled=False), world.rig, 0), keyframes[:12], poses[:12])
     assert edges == []

@@ -11,6 +11,7 @@ from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, Lo
 from vislam.loop.closer import LoopCloser
 from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, room
 
+Laps = tuple[LandmarkWorld, list[Array], list[Keyframe]]
 PER_LAP = 40
 LOST = PER_LAP + 6  # the keyframe after the loss, of the second lap
 CONFIG = LoopConfig()
@@ -18,7 +19,7 @@ AWAY = body_pose((40.0, 5.0, 0.0), 70.0)
 
 
 @pytest.fixture(scope="module")
-def laps() -> tuple[LandmarkWorld, list[Array], list[Keyframe]]:
+def laps() -> Laps:
     world, rng, poses = room(1), np.random.default_rng(0), lap_poses(1.5, PER_LAP)
     return world, poses, [world.see(i, pose, rng) for i, pose in enumerate(poses)]
 
@@ -39,9 +40,7 @@ def go_on(
     ]
 
 
-def test_a_new_submap_offers_what_looks_alike_from_its_first_keyframe_on(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_a_new_submap_offers_what_looks_alike_from_its_first_keyframe_on(laps: Laps) -> None:
     world, poses, keyframes = laps
     detector = begin(world, keyframes, poses, CONFIG)
     found = go_on(detector, keyframes[LOST : LOST + 2], [AWAY @ pose for pose in poses[LOST : LOST + 2]])
@@ -53,9 +52,7 @@ def test_a_new_submap_offers_what_looks_alike_from_its_first_keyframe_on(
             assert np.linalg.norm(error[3:]) < 0.05 and np.linalg.norm(error[:3]) < np.deg2rad(1.0)
 
 
-def test_poses_count_again_once_the_graph_has_joined(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_poses_count_again_once_the_graph_has_joined(laps: Laps) -> None:
     world, poses, keyframes = laps
     detector = begin(world, keyframes, poses, replace(CONFIG, island_gap=0))  # odometry's are not left out for others
     go_on(detector, keyframes[LOST : LOST + 2], [AWAY @ pose for pose in poses[LOST : LOST + 2]])
@@ -66,9 +63,7 @@ def test_poses_count_again_once_the_graph_has_joined(
     assert "odometry" in {c.source for c in candidates if c.decision is LoopDecision.ACCEPTED}
 
 
-def test_a_loss_right_at_the_start_needs_no_words_of_the_run(
-    laps: tuple[LandmarkWorld, list[Array], list[Keyframe]],
-) -> None:
+def test_a_loss_right_at_the_start_needs_no_words_of_the_run(laps: Laps) -> None:
     world, poses, keyframes = laps
     detector = LoopCloser(CONFIG, world.rig, 0)
     for k in range(4):

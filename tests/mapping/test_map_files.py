@@ -101,26 +101,6 @@ def test_damaged_and_hostile_pcd_files_are_errors(tmp_path, content, words):
         read_pcd(path)
 
 
-@pytest.mark.parametrize(("read", "write"), [(read_pcd, write_pcd), (read_ply, write_ply)])
-def test_any_damage_to_a_cloud_is_an_error_or_another_cloud(tmp_path, read, write):
-    path = tmp_path / "file"
-    write(path, *some_points(20))
-    whole = path.read_bytes()
-
-    @settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-    @given(st.integers(0, len(whole) - 1), st.binary(max_size=6), st.integers(0, len(whole)))
-    def damage(place, put, length):
-        path.write_bytes((whole[:place] + put + whole[place + len(put) :])[:length])
-        try:
-            points, colors = read(path)
-        except DataError:
-            return
-        assert points.shape == colors.shape
-        assert points.nbytes <= 12 * len(whole)
-
-    damage()
-
-
 def test_pcd_of_others_is_read(tmp_path):
     fields = header(
         FIELDS=b"_ x y z _ intensity _", SIZE=b"1 8 8 8 4 4 2", TYPE=b"U F F F F F U", COUNT=b"3 1 1 1 2 1 5"
@@ -175,9 +155,17 @@ def test_damaged_and_hostile_meshes_are_errors(tmp_path, old, new, words):
         read_ply_mesh(path)
 
 
-def test_any_damage_to_a_mesh_is_an_error_or_another_mesh(tmp_path):
-    path = tmp_path / "a.ply"
-    write_mesh(path)
+@pytest.mark.parametrize(
+    ("read", "write"),
+    [
+        (read_pcd, lambda path: write_pcd(path, *some_points(20))),
+        (read_ply, lambda path: write_ply(path, *some_points(20))),
+        (read_ply_mesh, write_mesh),
+    ],
+)
+def test_any_damage_is_an_error_or_another_cloud_or_mesh(tmp_path, read, write):
+    path = tmp_path / "file"
+    write(path)
     whole = path.read_bytes()
 
     @settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
@@ -185,10 +173,12 @@ def test_any_damage_to_a_mesh_is_an_error_or_another_mesh(tmp_path):
     def damage(place, put, length):
         path.write_bytes((whole[:place] + put + whole[place + len(put) :])[:length])
         try:
-            points, _, triangles = read_ply_mesh(path)
+            points, colors, *meshed = read(path)
         except DataError:
             return
-        assert triangles.size == 0 or triangles.max() < len(points)
+        assert points.shape == colors.shape
+        assert points.nbytes <= 12 * len(whole)
+        assert all(triangles.size == 0 or triangles.max() < len(points) for triangles in meshed)
 
     damage()
 
