@@ -13,8 +13,10 @@ from test_graph_tight import TIGHT, make  # noqa: F401  a fixture
 from vislam.config import GraphConfig, WindowConfig
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, so3_exp, transform
+from vislam.core.memory import Tied
 from vislam.core.messages import Array, GraphUpdate, LoopDecision, LoopEdge, Submaps
 from vislam.graph import PoseGraph
+from vislam.graph.belief.anchors import Anchors
 from vislam.graph.travel import Travel
 from worlds.lap import RIG, World, rmse_m
 from worlds.parts import MACHINE
@@ -286,3 +288,20 @@ def test_joined_is_an_equivalence_and_groups_are_named_by_their_oldest(
     assert all(group == min(p for p, g in enumerate(submaps.groups) if g == group) for group in submaps.groups)
     assert len(set(submaps.groups)) >= len(submaps.groups) - len(pairs)
     assert submaps.joined_by([]).groups == tuple(range(len(begins) + 1))
+
+
+def test_sigmas_of_odometry_grow_by_their_factor_and_the_way_stays() -> None:
+    travel = Travel()
+    for _ in range(3):
+        travel.append(1e-4, 9e-4, transform(np.eye(3), np.array([2.0, 0.0, 0.0])))
+    before = travel.between(0, 3)
+    travel.scale(3.0)
+    assert travel.between(0, 3) == pytest.approx((9.0 * before[0], 9.0 * before[1], before[2]))
+
+
+def test_the_nearest_tied_keyframe_stands_for_the_place() -> None:
+    anchors = Anchors(GraphConfig(), None)
+    for k in (40, 50):
+        anchors.tie(Tied(k, k - 30, np.zeros((6, 6))))
+    near = {k: anchors.near(k) for k in (29, 31, 44, 46, 60, 61)}
+    assert {k: tied and tied.id for k, tied in near.items()} == {29: None, 31: 40, 44: 40, 46: 50, 60: 50, 61: None}
