@@ -32,16 +32,12 @@ __all__ = [
 __getattr__ = late(
     __name__,
     {
-        "BatchResult": "vislam.batch.bundle.bundle_adjustment",
-        "optimize_run": "vislam.batch.bundle.bundle_adjustment",
+        "BatchResult optimize_run": "vislam.batch.bundle.bundle_adjustment",
         "LoopVerdict": "vislam.batch.bundle.loops",
         "PoseGraphFile": "vislam.batch.posegraph.graph_file",
-        "read_pose_graph": "vislam.batch.posegraph.files",
-        "write_pose_graph": "vislam.batch.posegraph.files",
-        "PoseGraphSolution": "vislam.batch.posegraph.optimize",
-        "optimize_pose_graph": "vislam.batch.posegraph.optimize",
+        "read_pose_graph write_pose_graph": "vislam.batch.posegraph.files",
+        "PoseGraphSolution optimize_pose_graph": "vislam.batch.posegraph.optimize",
         "PoseGraphProblem": "vislam.batch.posegraph.problem",
-        "simulate_graph": "vislam.batch.posegraph.worlds",
-        "write_simulated": "vislam.batch.posegraph.worlds",
+        "simulate_graph write_simulated": "vislam.batch.posegraph.worlds",
     },
 )

@@ -19,8 +19,7 @@ __all__ = [
 __getattr__ = late(
     __name__,
     {
-        "PosePublisher": "vislam.live.wire.publisher",
-        "PoseReader": "vislam.live.wire.publisher",
+        "PosePublisher PoseReader": "vislam.live.wire.publisher",
         "PublishedPose": "vislam.live.wire.published_pose",
     },
 )

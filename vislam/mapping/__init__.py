@@ -31,15 +31,12 @@ __all__ = [
 __getattr__ = late(
     __name__,
     {
-        "Drive": "vislam.mapping.drive.drive",
-        "DriveMap": "vislam.mapping.drive.drive",
+        "Drive DriveMap": "vislam.mapping.drive.drive",
         "Guess": "vislam.mapping.depth.localise",
         "LabelClasses": "vislam.mapping.semantic.classes",
         "Mapper": "vislam.mapping.mapper",
-        "label_at": "vislam.mapping.semantic.query",
-        "nearest": "vislam.mapping.semantic.query",
+        "label_at nearest things_of": "vislam.mapping.semantic.query",
         "read_layer": "vislam.mapping.semantic.layer_files",
-        "things_of": "vislam.mapping.semantic.query",
         "write_products": "vislam.mapping.products",
     },
 )
