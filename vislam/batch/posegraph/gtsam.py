@@ -125,18 +125,9 @@ def _from_edge(problem: PoseGraphProblem, isam: gtsam.ISAM2, i: int, edges: list
         a, b = problem.edges[e].tolist()
         if problem.is_position[e] and not problem.is_point[i]:
             continue
-        Z, other = problem.measurements[e], _current(problem, isam, a if b == i else b)
+        Z, other = problem.measurements[e], _matrix(problem, a if b == i else b, isam, "calculateEstimate")
         return np.asarray(other @ Z if b == i else other @ np.linalg.inv(Z))
     return None
-
-
-def _current(problem: PoseGraphProblem, isam: gtsam.ISAM2, i: int) -> Array:
-    two = problem.dimension == 2
-    if not problem.is_point[i]:
-        return np.asarray((isam.calculateEstimatePose2(i) if two else isam.calculateEstimatePose3(i)).matrix())
-    out = np.eye(problem.dimension + 1)
-    out[:-1, -1] = isam.calculateEstimatePoint2(i) if two else isam.calculateEstimatePoint3(i)
-    return out
 
 
 def _pose(problem: PoseGraphProblem, T: Array) -> Any:
@@ -149,11 +140,10 @@ def _value(problem: PoseGraphProblem, i: int, T: Array) -> Any:
 
 
 def _anchor(problem: PoseGraphProblem, i: int, T: Array, sigma: float = _ANCHOR_SIGMA) -> Any:
-    two, point = problem.dimension == 2, bool(problem.is_point[i])
+    point = bool(problem.is_point[i])
     model = gtsam.noiseModel.Isotropic.Sigma(problem.dimension if point else problem.tangent, sigma)
-    of_points = gtsam.PriorFactorPoint2 if two else gtsam.PriorFactorPoint3
-    of_poses = gtsam.PriorFactorPose2 if two else gtsam.PriorFactorPose3
-    return (of_points if point else of_poses)(i, _value(problem, i, T), model)
+    prior = getattr(gtsam, f"PriorFactor{'Point' if point else 'Pose'}{problem.dimension}")
+    return prior(i, _value(problem, i, T), model)
 
 
 def _factor(problem: PoseGraphProblem, e: int, weight: float) -> Any:
@@ -195,12 +185,14 @@ def _between(problem: PoseGraphProblem, e: int, weight: float) -> Any:
     return kind(a, b, _pose(problem, problem.measurements[e]), model)
 
 
-def _matrix(problem: PoseGraphProblem, i: int, values: gtsam.Values) -> Array:
-    two = problem.dimension == 2
-    if not problem.is_point[i]:
-        return np.asarray((values.atPose2(i) if two else values.atPose3(i)).matrix())
+def _matrix(problem: PoseGraphProblem, i: int, solved: Any, ask: str = "at") -> Array:
+    """Return a pose, or the position of a landmark, of values, or of an iSAM2 where that is asked otherwise."""
+    point = bool(problem.is_point[i])
+    value = getattr(solved, f"{ask}{'Point' if point else 'Pose'}{problem.dimension}")(i)
+    if not point:
+        return np.asarray(value.matrix())
     out = np.eye(problem.dimension + 1)
-    out[:-1, -1] = values.atPoint2(i) if two else values.atPoint3(i)
+    out[:-1, -1] = value
     return out
 
 

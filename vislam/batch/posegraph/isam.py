@@ -70,10 +70,7 @@ def read_isam(path: Path, repair: bool = False, noise: Noise | Literal["auto"] =
     measured = poses_of(edges.numbers, two)
     form, notes = _form(edges, noise) if two else ("root", ())
     J = _file_tangent(path, measured, edges.lines)
-    if form == "root":
-        information = _squared(path, edges, J)
-    else:
-        information = J.transpose(0, 2, 1) @ information_of(path, edges.numbers[:, 3:], edges.lines, form) @ J
+    information = J.transpose(0, 2, 1) @ information_of(path, edges.numbers[:, J.shape[1] :], edges.lines, form) @ J
     information = 0.5 * (information + information.transpose(0, 2, 1))
     poses = PoseLines(vertices.ids.reshape(-1), poses_of(vertices.numbers, two), vertices.lines)
     found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
@@ -96,20 +93,6 @@ def _form(edges: Rows, noise: Noise | Literal["auto"]) -> tuple[Noise, tuple[str
         f"headings would be off by {1.0 / root:.2g} rad, which is meaningless; --isam-noise root reads them so"
     )
     return "covariance", (note,)
-
-
-def _squared(path: Path, edges: Rows, J: Array) -> Array:
-    """Return information [E, k, k] of square roots in the file's tangent."""
-    k = J.shape[1]
-    R = np.zeros((len(edges.ids), k, k))
-    a, b = np.triu_indices(k)
-    R[:, a, b] = edges.numbers[:, k:]
-    with np.errstate(over="ignore", invalid="ignore"):
-        information = (R @ J).transpose(0, 2, 1) @ (R @ J)
-    if not np.isfinite(information).all():
-        line = edges.lines[int(np.argmin(np.isfinite(information).all(axis=(1, 2))))]
-        raise DataError(f"{path}:{line}: the square of the square root of the information is not finite")
-    return np.asarray(information)
 
 
 def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

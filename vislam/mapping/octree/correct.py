@@ -168,7 +168,7 @@ class CorrectedOccupancy:
             keyframe_id = order[patch.replayed]
             said = patch.moved.get(keyframe_id) or self._said[keyframe_id]
             if patch.blocks.pool.holds_any(said.blocks):
-                patch.blocks.apply_to_known_blocks(said.marks())
+                patch.blocks.apply(said.marks(), only_known=True)
                 budget -= 1
             patch.replayed += 1
         if patch.replayed == len(order):

@@ -146,17 +146,14 @@ class Octree:
         keys, bits = pack_marks(marked_blocks(words, blocks), words, blocks, base)
         return ScanMarks(len(points), keys, bits)
 
-    def apply(self, marks: ScanMarks) -> None:
-        """Update every voxel that a scan marks; raises DataError when the map would outgrow any machine."""
-        self.pool.reserve(len(marks.blocks))
-        self._apply(marks, False)
+    def apply(self, marks: ScanMarks, only_known: bool = False) -> None:
+        """Update every voxel that a scan marks, or those in blocks that the map has.
 
-    def apply_to_known_blocks(self, marks: ScanMarks) -> None:
-        """Update the voxels that a scan marks in the blocks that the map has."""
-        self._apply(marks, True)
-
-    def _apply(self, marks: ScanMarks, only_known: bool) -> None:
+        Raises DataError when the map would outgrow any machine.
+        """
         pool = self.pool
+        if not only_known:
+            pool.reserve(len(marks.blocks))
         pool.count = apply_marks(
             marks.blocks, marks.bits, only_known, Voxels(pool.table, pool.rows, pool.keys, pool.values), pool.count,
             LogOdds(self._hit, self._miss, self._beside, self._low, self._high),
