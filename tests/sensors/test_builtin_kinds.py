@@ -48,7 +48,8 @@ SENSORS: dict[str, Configured] = {
     "position in the world": Position(PositionSettings(frame="known", lever_m=(0.3, -0.2, 0.5))),
     "range": AnchorRange(AnchorRangeSettings(ANCHORS)),
     "range of all unknown": AnchorRange(
-        AnchorRangeSettings(ANCHORS, anchor_sigma_m=0.2, lever_m=(0.1, 0.0, 0.3), lever_sigma_m=0.1, bias_sigma_m=0.3)
+        AnchorRangeSettings(ANCHORS, anchor_sigma_m=0.2, lever_m=(0.1, 0.0, 0.3), lever_sigma_m=0.1, bias_sigma_m=0.3,
+                            scale_sigma=0.1)
     ),
     "range in the world": AnchorRange(AnchorRangeSettings(ANCHORS, frame="known", bias_m=0.2)),
     "height": Height(HeightSettings(lever_m=(0.3, -0.2, 0.5))),
