@@ -10,9 +10,13 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.brief import said_of
 from vislam.cli.verbs.completion import known_options, script
+from vislam.cli.verbs.live import ResumeOptions
+from vislam.cli.verbs.web_page import PageOptions, opened
 from vislam.config.ranges import settings_of
+from vislam.core.errors import UsageError
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -93,6 +97,35 @@ def test_bash_completes_what_was_begun(typed: str, offered: set[str]) -> None:
     call = f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; _vislam; echo ${{COMPREPLY[@]}}"
     done = subprocess.run(["bash", "-c", f"{script()}\n{call}"], capture_output=True, text=True, check=True)
     assert {*done.stdout.split()} == offered
+
+
+@pytest.mark.parametrize(
+    ("given", "page"),
+    [
+        (["--seconds", "1"], PageOptions()),
+        (["--web"], PageOptions(())),
+        (["--web", "--seconds", "1"], PageOptions(())),
+        (["--seconds", "1", "--web", ":9000"], PageOptions((":9000",))),
+        (["--web=0.0.0.0:1", "--web-waits"], PageOptions(("0.0.0.0:1",), True)),
+        (["--web", "--web-host", "a.b", "--web-host", "c"], PageOptions((), False, ("a.b", "c"))),
+    ],
+)
+def test_options_of_the_page_are_understood(given, page) -> None:
+    assert parse(ResumeOptions, given, "live").page == page
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        PageOptions(None, True),
+        PageOptions(web_host=("a",)),
+        PageOptions((), False, ("http://a",)),
+        PageOptions(("a:1", "b:2")),
+    ],
+)
+def test_options_of_the_page_that_make_no_sense_are_refused(page, tmp_path) -> None:
+    with pytest.raises(UsageError), opened(page, "cart", tmp_path):
+        pass
 
 
 def test_a_pose_graph_given_to_optimize_is_handed_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,9 +15,6 @@ import psutil
 import pytest
 
 from vislam.cli import run_verb
-from vislam.cli.verbs.arguments import parse
-from vislam.cli.verbs.live import ResumeOptions
-from vislam.cli.verbs.web_page import PageOptions, opened
 from vislam.core.errors import UsageError
 from vislam.live.web.address import parsed
 from vislam.live.web.station import Station
@@ -103,35 +100,6 @@ def test_commands_that_nobody_takes_are_bounded() -> None:
     full = SimpleNamespace(put=lambda value: False)
     assert _Commands(full, full).take({"do": "stop"}).status == 503
     assert _Commands(full, full).take({"do": "save"}).status == 503
-
-
-@pytest.mark.parametrize(
-    ("given", "page"),
-    [
-        (["--seconds", "1"], PageOptions()),
-        (["--web"], PageOptions(())),
-        (["--web", "--seconds", "1"], PageOptions(())),
-        (["--seconds", "1", "--web", ":9000"], PageOptions((":9000",))),
-        (["--web=0.0.0.0:1", "--web-waits"], PageOptions(("0.0.0.0:1",), True)),
-        (["--web", "--web-host", "a.b", "--web-host", "c"], PageOptions((), False, ("a.b", "c"))),
-    ],
-)
-def test_options_of_the_page_are_understood(given, page) -> None:
-    assert parse(ResumeOptions, given, "live").page == page
-
-
-@pytest.mark.parametrize(
-    "page",
-    [
-        PageOptions(None, True),
-        PageOptions(web_host=("a",)),
-        PageOptions((), False, ("http://a",)),
-        PageOptions(("a:1", "b:2")),
-    ],
-)
-def test_options_of_the_page_that_make_no_sense_are_refused(page, tmp_path) -> None:
-    with pytest.raises(UsageError), opened(page, "cart", tmp_path):
-        pass
 
 
 @pytest.mark.parametrize("at", ["8765", "no such:1", "no-such-host.invalid:80", "203.0.113.7:80"])
