@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_graph_optimize import world
 
+from vislam.batch.posegraph.gnc import joining_edges
 from vislam.batch.posegraph.optimize import optimize_pose_graph
 from vislam.config import PoseGraphConfig
 
@@ -49,3 +50,9 @@ def test_without_false_loops_nothing_is_lost(d):
         problem, edges=problem.edges[:79], measurements=problem.measurements[:79], information=problem.information[:79]
     )
     assert optimize_pose_graph(chain, PoseGraphConfig(robust="gnc")).weights.tolist() == [1.0] * 79
+
+
+def test_parts_are_joined_once_whole():
+    few, _ = world(2, n=4, loops=1)
+    parts = replace(few, edges=np.array([[0, 1], [2, 3], [1, 2], [0, 3]]))
+    assert joining_edges(parts, np.array([True, True, False, False])).tolist() == [False, False, True, False]

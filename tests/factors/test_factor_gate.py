@@ -40,7 +40,9 @@ def test_a_graph_that_knows_nothing_lets_a_loop_pass(world: World) -> None:
     model = _model(world.loop(0, 5, 105))
     ignorant = np.zeros((6, 6))
     ignorant[3, 3] = 1e30
+    elsewhere = world.truth[105] @ se3_exp(np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0]))
     assert model.chi2(world.truth[5], world.truth[105], ignorant) < model.threshold
+    assert model.chi2(world.truth[5], elsewhere, ignorant) < model.threshold < model.chi2(world.truth[5], elsewhere)
 
 
 def test_loops_about_the_same_two_places_are_one_witness(world: World) -> None:
@@ -51,6 +53,15 @@ def test_loops_about_the_same_two_places_are_one_witness(world: World) -> None:
     for model in [*models, lie]:
         witnesses.add(model, travel)
     assert witnesses.loops() == [[*models[:3], models[4]], [models[3]], [lie]]
+
+
+def test_a_loop_that_turns_as_it_may_is_the_same_witness_though_its_lever_moves_the_place(world: World) -> None:
+    witnesses, travel = Witnesses(GraphConfig()), _travel(world)
+    covariance = np.diag(np.repeat([0.1**2, 0.005**2], 3))
+    for n, (i, j, turn_rad) in enumerate([(5, 105, 0.0), (14, 114, 0.3)]):
+        T = invert(world.truth[i]) @ world.truth[j] @ se3_exp(np.array([0.0, 0.0, turn_rad, 0.0, 0.0, 0.0]))
+        witnesses.add(_model(LoopEdge(n, i, j, T, covariance, True, 60, 0.5)), travel)
+    assert len(witnesses) == 1
 
 
 def test_loops_confirm_one_another_only_where_odometry_can_tell(world: World) -> None:

@@ -118,3 +118,9 @@ def test_bias_walk_is_floored_against_gtsams_pivot_test() -> None:
     integrator = Preintegrator(config, tiny, MACHINE)
     assert integrator.gyroscope_random_walk == GYRO_BIAS_WALK_FLOOR
     assert integrator.accelerometer_random_walk == ACCEL_BIAS_WALK_FLOOR
+
+
+def test_biases_walk_with_the_root_of_time_that_of_the_accelerometer_first() -> None:
+    noise = replace(EUROC_NOISE, gyroscope_random_walk=0.01, accelerometer_random_walk=0.03)
+    walked = Preintegrator(GraphConfig(), noise, MACHINE).bias_walk_sigmas(4.0)
+    np.testing.assert_allclose(walked, [0.06, 0.06, 0.06, 0.02, 0.02, 0.02])

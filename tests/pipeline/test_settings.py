@@ -106,3 +106,10 @@ def test_wheels_without_slip_need_the_loose_filter():
     source = recording()
     with pytest.raises(UsageError, match="slip"):
         derived(load(None, {"machine.slip_sigma_m_s": 0.02}), source.rig, source.imu_noise)
+
+
+@pytest.mark.parametrize(("rig", "has_imu", "shares"), [("mono", 1, True), ("mono", 0, False), ("stereo", 1, False)])
+def test_edges_share_the_scale_that_the_imu_gives_to_one_camera(rig, has_imu, shares):
+    source = recording(rig)
+    noise = source.imu_noise if has_imu else None
+    assert derived(load(None, {}), source.rig, noise).graph.edges_share_scale is shares
