@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -13,6 +14,7 @@ from vislam.config import FurtherSensorsConfig
 from vislam.core.errors import UsageError
 from vislam.core.readings import Reading
 from vislam.live.epoch import Epoch
+from vislam.live.port_readings import PortReadings
 from vislam.sensors import SensorSetup, Suite, load_sensor_setup
 from vislam.sensors.geodetic import Geodetic
 
@@ -52,7 +54,7 @@ def live_readings(
     refuses.
     """
     if config.file is None:
-        return Suite(), NoReadings
+        return Suite(), partial(PortReadings, {})
     setup = load_sensor_setup(Path(config.file))
     return setup.suite, opener(setup)
 
@@ -67,31 +69,8 @@ def refuse_unread(setup: SensorSetup, readable: Mapping[str, object], asked: str
         raise UsageError(f"[sensors.{missing[0]}]: {asked}; docs/more-sensors.md, Live")
 
 
-class NoReadings:
-    """No further sensors."""
-
-    def read(self) -> list[Reading]:
-        """Return nothing."""
-        return []
-
-    def status(self) -> dict[str, str]:
-        """Return nothing."""
-        return {}
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """Return nothing."""
-        return {}
-
-    def datums(self) -> dict[str, Geodetic]:
-        """Return nothing."""
-        return {}
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
 class Heard:
-    """When each sensor was heard last."""
+    """When each sensor was heard last, of sensors without a device, whose datums are known from the beginning."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         """Begin with none heard."""
@@ -110,18 +89,25 @@ class Heard:
         now_s = time.monotonic()
         return {name: _ago(now_s - last_s) for name, last_s in self._last_s.items()}
 
+    def datums(self) -> dict[str, Geodetic]:
+        """Return nothing."""
+        return {}
 
-class ReplayedReadings:
+    def close(self) -> None:
+        """Do nothing; may be called twice."""
+
+
+class ReplayedReadings(Heard):
     """Plays readings of a recording at their times."""
 
     def __init__(
         self, names: tuple[str, ...], streams: Callable[[], Iterator[Reading]], zero_ns: int, epoch: Epoch
     ) -> None:
         """Open the streams, in time order; `zero_ns` of them is the epoch."""
+        super().__init__(names)
         self._readings = streams()
         self._zero_ns, self._epoch = zero_ns, epoch
         self._next = next(self._readings, None)
-        self._heard = Heard(names)
 
     def read(self) -> list[Reading]:
         """Return the readings whose time has come; see `ReadingSource`."""
@@ -130,20 +116,12 @@ class ReplayedReadings:
         while self._next is not None and self._next.t_ns + shift_ns <= now_ns:
             out.append(replace(self._next, t_ns=self._next.t_ns + shift_ns))
             self._next = next(self._readings, None)
-        self._heard.hear(out)
+        self.hear(out)
         return out
-
-    def status(self) -> dict[str, str]:
-        """Return which sensors are silent."""
-        return self._heard.status()
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return how many readings of each sensor were played."""
-        return {name: {"played": count} for name, count in self._heard.count.items()}
-
-    def datums(self) -> dict[str, Geodetic]:
-        """Return nothing: those of files are known without playing them."""
-        return {}
+        return {name: {"played": count} for name, count in self.count.items()}
 
     def close(self) -> None:
         """Stop reading."""

@@ -25,6 +25,7 @@ from vislam.live.replayed_imu import InertialTable, ReplayedImu
 from vislam.runs.further_sensors import FurtherReadings
 from vislam.runs.sources import open_source
 from vislam.sensors import SensorSetup
+from vislam.sensors.simulated import within
 from vislam.trajectory import Trajectory
 
 _NS = 1_000_000_000
@@ -135,7 +136,7 @@ class ReplayedFrames:
             now_ns = time.monotonic_ns()
             while self._next is not None and self._next.t_ns + shift_ns <= now_ns:
                 since_s = (self._next.t_ns - self._zero_ns) / _NS
-                if not is_out(since_s, self._outages):
+                if not within(since_s, self._outages):
                     self._counts["captured"] += 1
                     self._counts["dropped"] += newest is not None
                     newest = self._next
@@ -182,8 +183,3 @@ def read_along(opener: Callable[[], Recording], setup: SensorSetup, seed: int) -
     """
     further = FurtherReadings(opener(), setup, seed)
     return heapq.merge(*further.streams(), key=lambda reading: reading.t_ns)
-
-
-def is_out(since_s: float, outages: tuple[tuple[float, float], ...]) -> bool:
-    """Return whether a sensor is unplugged."""
-    return any(begin <= since_s < end for begin, end in outages)

@@ -14,18 +14,18 @@ from vislam.live.reading_source import Heard
 from vislam.live.virtual.motion import Follower, Segment
 from vislam.live.virtual.place import BODY_HEIGHT_M
 from vislam.sensors import BodyState, SensorSetup
-from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.simulated import slipping, within
 
 _NS = 1_000_000_000
 _KNOWN_S = 5.0  # of the motion; a later query misses what was before
 
 
-class VirtualReadings:
+class VirtualReadings(Heard):
     """Satisfies `ReadingSource`; own variables are drawn by their sigmas, as of a recording."""
 
     def __init__(self, cart: str, epoch: Epoch, setup: SensorSetup, seed: int) -> None:
         """Put the simulated sensors of a setup on the cart whose segments are published under a name."""
+        super().__init__(tuple(setup.simulated_hz))
         self._follower, self._epoch, self._setup = Follower.waiting(cart), epoch, setup
         self._rngs, self._own = {}, dict[str, Array]()
         self._is_placed = dict.fromkeys(setup.simulated_hz, False)
@@ -34,7 +34,6 @@ class VirtualReadings:
             self._own[name] = setup.suite.drawn_own(name, self._rngs[name])
         self._drawn = dict.fromkeys(setup.simulated_hz, 0)  # how many of each, those that were missed included
         self._missed = dict.fromkeys(setup.simulated_hz, 0)
-        self._heard = Heard(tuple(setup.simulated_hz))
 
     def read(self) -> list[Reading]:
         """Return the readings whose time has come; see `ReadingSource`."""
@@ -56,23 +55,12 @@ class VirtualReadings:
                 if within(t_s, faults.slips):
                     values = slipping(sensor, values, faults)
                 out.append(Reading(name, body.t_ns, values))
-        self._heard.hear(out)
+        self.hear(out)
         return out
-
-    def status(self) -> dict[str, str]:
-        """Return which sensors are silent."""
-        return self._heard.status()
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return how many readings of each sensor were drawn, and how many were not asked for in time."""
-        return {name: {"drawn": count, "missed": self._missed[name]} for name, count in self._heard.count.items()}
-
-    def datums(self) -> dict[str, Geodetic]:
-        """Return nothing: all is known without them."""
-        return {}
-
-    def close(self) -> None:
-        """Do nothing; may be called twice."""
+        return {name: {"drawn": count, "missed": self._missed[name]} for name, count in self.count.items()}
 
 
 def body_at(segment: Segment, t_ns: int) -> BodyState:
