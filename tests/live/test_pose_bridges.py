@@ -24,7 +24,7 @@ from vislam.core.errors import UsageError
 from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.hw.health import Health
 from vislam.live.bridges import translator
-from vislam.live.processes.child import Flag, Signals, guarded
+from vislam.live.processes.child import Child, Flag, Signals
 from vislam.live.wire.publisher import PosePublisher
 
 _DOMAIN = 100 + os.getpid() % 100  # not the domain of whatever else runs here
@@ -134,19 +134,15 @@ class Bridge:
     """A translator's process, run as a live run does."""
 
     def __init__(self, live: LiveConfig, role: str) -> None:
-        context = get_context("spawn")
         self.at, body = translator.asked(live)[role]
         self._signals = Signals(Flag(), Flag())
-        self.report, says = context.Pipe(duplex=False)
-        self._process = context.Process(target=guarded, args=(role, says, self._signals, body))
-        self._process.start()
-        says.close()
+        self._child = Child.started(role, self._signals, body)
         self._signals.go.set()
 
     def end(self) -> int | None:
         self._signals.stop.set()
-        self._process.join(600.0)
-        return self._process.exitcode
+        self._child.process.join(600.0)
+        return self._child.process.exitcode
 
 
 @needs_dds

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import logging
-import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from multiprocessing import connection, get_context
-from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
 from vislam.config import Config
-from vislam.core import interrupts, log
+from vislam.core import interrupts
 from vislam.core.errors import HardwareError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.recording import Recording
@@ -29,7 +27,7 @@ from vislam.live.processes import back as back_process
 from vislam.live.processes import fast as fast_process
 from vislam.live.processes import front as front_process
 from vislam.live.processes import map as map_process
-from vislam.live.processes.child import Failure, Flag, Life, Note, Ready, Signals, guarded, measured
+from vislam.live.processes.child import Child, Failure, Flag, Life, Note, Ready, Signals, measured
 from vislam.live.reading_source import ReadingSource, live_readings
 from vislam.live.web.updates import WebEnds
 from vislam.live.wire.slot import remove
@@ -81,25 +79,6 @@ class LiveSource(Recording, Protocol):
         ...
 
 
-@dataclass(slots=True)
-class _Child:
-    process: SpawnProcess
-    report: Connection
-    is_ready: bool = False
-
-    def messages(self) -> Iterator[Ready | Note | Failure]:
-        """Yield the process's messages since; what it logged is logged here."""
-        try:
-            while not self.report.closed and self.report.poll():
-                message = self.report.recv()
-                if isinstance(message, logging.LogRecord):
-                    log.take_record(message)
-                else:
-                    yield message
-        except (EOFError, OSError):
-            self.report.close()
-
-
 Show = Callable[["LiveRun"], None]  # is called now and then
 
 
@@ -148,7 +127,7 @@ class LiveRun:
         self._source, self._out, self._shared_name = source, out, config.live.name
         self._context = get_context("spawn")
         self._signals = Signals(Flag(), Flag())
-        self._children: dict[str, _Child] = {}
+        self._children: dict[str, Child] = {}
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
         self._bias = KeptBias(config.power_up)
@@ -294,19 +273,9 @@ class LiveRun:
         self._watch(show)
 
     def _start(self) -> None:
-        """Start every process; no signal reaches one that is not ready for it."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)
-        try:
-            for role, body in self._roles.items():
-                receiver, sender = self._context.Pipe(duplex=False)
-                process = self._context.Process(
-                    target=guarded, args=(role, sender, self._signals, body, log.level()), name=f"vislam {role}"
-                )
-                process.start()
-                sender.close()
-                self._children[role] = _Child(process, receiver)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        """Start every process."""
+        for role, body in self._roles.items():
+            self._children[role] = Child.started(role, self._signals, body)
         for end in self._ends:
             end.close()
 
@@ -328,7 +297,7 @@ class LiveRun:
         if show is not None:
             show(self)
 
-    def _hear(self, role: str, child: _Child) -> None:
+    def _hear(self, role: str, child: Child) -> None:
         for message in child.messages():
             if isinstance(message, Ready):
                 child.is_ready = True

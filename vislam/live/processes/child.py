@@ -10,16 +10,16 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from multiprocessing import parent_process
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import RawValue
 from typing import Any
 
-from vislam.core import interrupts
+from vislam.core import interrupts, log
 from vislam.core.errors import VislamError, storage_failure
-from vislam.core.log import log_through
 
 _POLL_S = 0.005
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -148,11 +148,48 @@ def guarded(
     _die_with_parent(True)
     life = Life(role, report, signals)
     try:
-        with log_through(life.send, log_level):
+        with log.log_through(life.send, log_level):
             body(life)
     except Exception as error:
         life.send(Failure(role, _portable(error), traceback.format_exc()))
         raise SystemExit(1) from None
+
+
+@dataclass(slots=True)
+class Child:
+    """A process that was started, as its parent sees it."""
+
+    process: SpawnProcess
+    report: Connection
+    is_ready: bool = False
+
+    @classmethod
+    def started(cls, role: str, signals: Signals, body: Callable[[Life], None]) -> Child:
+        """Start a process; no signal reaches it before it is ready for one."""
+        context = get_context("spawn")
+        report, sender = context.Pipe(duplex=False)
+        process = context.Process(
+            target=guarded, args=(role, sender, signals, body, log.level()), name=f"vislam {role}"
+        )
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        sender.close()
+        return cls(process, report)
+
+    def messages(self) -> Iterator[Ready | Note | Failure]:
+        """Yield the process's messages since; what it logged is logged here."""
+        try:
+            while not self.report.closed and self.report.poll():
+                message = self.report.recv()
+                if isinstance(message, logging.LogRecord):
+                    log.take_record(message)
+                else:
+                    yield message
+        except (EOFError, OSError):
+            self.report.close()
 
 
 def _die_with_parent(is_on: bool) -> None:

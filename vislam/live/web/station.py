@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-import signal
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from vislam.core import interrupts, log
 from vislam.core.files import plain
-from vislam.live.processes.child import Failure, Flag, Signals, guarded
+from vislam.live.processes.child import Child, Failure, Flag, Signals
 from vislam.live.run_live import LiveRun
 from vislam.live.status import status_line
 from vislam.live.web import web_process
@@ -56,22 +54,14 @@ class Station:
         frames, to_frames = context.Pipe(duplex=False)
         map_wire, to_map = context.Pipe()
         self.ends = WebEnds(to_frames, to_map)
-        self._reports, sender = context.Pipe(duplex=False)
         self._signals = Signals(Flag(), Flag())
         self._signals.go.set()
         body = partial(
             web_process.run, listener=listener, gate=gate, owner=to_owner, frames=frames, map_wire=map_wire,
             pose_name=pose_name,
         )  # fmt: skip
-        self._process = context.Process(
-            target=guarded, args=("web", sender, self._signals, body, log.level()), name="vislam web"
-        )
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)  # until it is ready for one
-        try:
-            self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for end in (sender, to_owner, frames, map_wire):
+        self._child = Child.started("web", self._signals, body)
+        for end in (to_owner, frames, map_wire):
             end.close()
         listener.close()
         self._box, self._inbox = Outbox(owner, 2), Inbox(owner)
@@ -122,23 +112,19 @@ class Station:
     def close(self) -> None:
         """End the process; may be called twice."""
         self._signals.stop.set()
-        self._process.join(1.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        self._child.process.join(1.0)
+        if self._child.process.is_alive():
+            self._child.process.kill()
+            self._child.process.join()
         for end in (self.ends.frames, self.ends.map):
             end.close()
 
     def _watch(self) -> None:
         """Log the process's messages, and that it died, once."""
-        with suppress(EOFError, OSError):
-            while self._reports.poll():
-                message = self._reports.recv()
-                if isinstance(message, logging.LogRecord):
-                    log.take_record(message)
-                elif isinstance(message, Failure):
-                    _LOG.error("the web process failed:\n%s", message.traceback)
-        if self.is_well and not self._process.is_alive() and not self._signals.stop.is_set():
+        for message in self._child.messages():
+            if isinstance(message, Failure):
+                _LOG.error("the web process failed:\n%s", message.traceback)
+        if self.is_well and not self._child.process.is_alive() and not self._signals.stop.is_set():
             self.is_well = False
             _LOG.warning("the process of the web page died; the run goes on without the page")
 
