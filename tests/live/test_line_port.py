@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
-import pty
 import time
-import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.live.test_gnss_port import Receiver
 from vislam.core.readings import Reading
 from vislam.hw import reading_port, talks
 from vislam.hw.talks import LineTalk
@@ -107,34 +106,16 @@ def test_counters_that_jump_or_pause_give_no_speed_and_say_why() -> None:
     assert talk.counters()["refused"] == 2
 
 
-class Device:
-    """A plug that a test pulls and puts back."""
-
-    def __init__(self, link: Path) -> None:
-        self.link = link
-        self.plug_in()
-
-    def plug_in(self) -> None:
-        self.master, self.slave = pty.openpty()
-        tty.setraw(self.slave)
-        self.link.symlink_to(os.ttyname(self.slave))
-
-    def unplug(self) -> None:
-        self.link.unlink()
-        os.close(self.slave)
-        os.close(self.master)
-
-
 @pytest.fixture
-def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Device]:
+def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Receiver]:
     monkeypatch.setattr(reading_port, "_REOPEN_S", 0.02)
     monkeypatch.setattr(talks, "_OLD_NS", round(LONG_S * 1e9))
-    device = Device(tmp_path / "tty")
+    device = Receiver(tmp_path / "tty")
     yield device
     device.unplug()
 
 
-def test_encoders_are_unplugged_and_begin_anew(device: Device) -> None:
+def test_encoders_are_unplugged_and_begin_anew(device: Receiver) -> None:
     sensors = PortReadings({"wheels": port(str(device.link))})
     found: list[Reading] = []
 

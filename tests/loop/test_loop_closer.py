@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from vislam.config import LoopConfig
-from vislam.core.geometry import invert, se3_exp, se3_log
+from vislam.core.geometry import invert, se3_exp, se3_log, transform
 from vislam.core.messages import Array, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
 from vislam.loop.closer import LoopCloser
 from worlds.landmarks import LandmarkWorld, body_pose, lap_poses, make_rig, room
 
 Laps = tuple[LandmarkWorld, list[Array], list[Keyframe]]
 PER_LAP = 40
+AWAY = transform(np.eye(3), np.array([40.0, 0.0, 0.0]))
 CONFIG = replace(LoopConfig(), appearance_skip_keyframes=12, appearance_skip_s=1.0)
 
 
@@ -71,9 +72,7 @@ def test_the_second_lap_closes_on_the_first(laps: Laps) -> None:
 def test_appearance_closes_loops_where_odometry_is_lost(laps: Laps) -> None:
     """The second lap's estimate is off by 40 m, so the map's poses suggest nothing; appearance alone must do it."""
     world, poses, keyframes = laps
-    away = np.eye(4)
-    away[:3, 3] = [40.0, 0.0, 0.0]
-    estimates = poses[:PER_LAP] + [away @ pose for pose in poses[PER_LAP:]]
+    estimates = poses[:PER_LAP] + [AWAY @ pose for pose in poses[PER_LAP:]]
     edges, candidates = run(LoopCloser(CONFIG, world.rig, 0), keyframes, estimates)
     # not the last two of the first lap, which are neighbours of what odometry finds at the end of the second
     closing = [edge for edge in edges if edge.from_id < PER_LAP - 2 and edge.to_id >= PER_LAP]
@@ -156,11 +155,9 @@ def test_a_tilted_copy_of_a_place_contradicts_gravity() -> None:
 def test_what_nothing_speaks_against_is_offered_at_once(laps: Laps) -> None:
     """The first keyframe that sees an old place offers its loops, however far off odometry is: the graph decides."""
     world, poses, keyframes = laps
-    away = np.eye(4)
-    away[:3, 3] = [40.0, 0.0, 0.0]
     detector = LoopCloser(replace(CONFIG, max_odometry=0), world.rig, 0)
     run(detector, keyframes[:PER_LAP], poses[:PER_LAP])
-    edges, candidates = detector.detect(keyframes[PER_LAP], away @ poses[PER_LAP])
+    edges, candidates = detector.detect(keyframes[PER_LAP], AWAY @ poses[PER_LAP])
     sound = [c for c in candidates if c.decision is not LoopDecision.REJECTED]
     assert edges
     assert {c.decision for c in sound} == {LoopDecision.ACCEPTED}
@@ -170,12 +167,10 @@ def test_what_nothing_speaks_against_is_offered_at_once(laps: Laps) -> None:
 def test_a_map_that_moves_is_followed(laps: Laps) -> None:
     """The old keyframes were 40 m off; once the graph has moved them, odometry finds them again."""
     world, poses, keyframes = laps
-    away = np.eye(4)
-    away[:3, 3] = [40.0, 0.0, 0.0]
     still = replace(CONFIG, max_appearance=0)
     for moves in (False, True):
         detector = LoopCloser(still, world.rig, 0)
-        run(detector, keyframes[:PER_LAP], [away @ pose for pose in poses[:PER_LAP]])
+        run(detector, keyframes[:PER_LAP], [AWAY @ pose for pose in poses[:PER_LAP]])
         if moves:
             ids = np.arange(PER_LAP + 3)  # some that the detector has not met yet
             detector.move(GraphUpdate(1, ids, np.stack(poses[: PER_LAP + 3]), np.eye(4), None))

@@ -85,15 +85,6 @@ def test_a_handful_of_points_passes_the_outlier_filter():
     assert len(without_outliers(random_cloud(0), 12, 2.5, 0.1)) == 0
 
 
-@pytest.mark.parametrize("count", [0, 1, 70000])
-def test_ply_round_trip(tmp_path, count):
-    cloud = random_cloud(count)
-    write_ply(tmp_path / "a.ply", cloud.points_m, cloud.colors)
-    points, colors = read_ply(tmp_path / "a.ply")
-    np.testing.assert_array_equal(points, cloud.points_m)
-    np.testing.assert_array_equal(colors, cloud.colors)
-
-
 def test_open3d_reads_our_mesh(tmp_path):
     open3d, reason = load_open3d()
     if open3d is None:

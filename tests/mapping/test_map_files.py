@@ -28,11 +28,12 @@ def some_points(count, seed=0):
     return rng.uniform(-5, 5, (count, 3)).astype(np.float32), rng.integers(0, 256, (count, 3)).astype(np.uint8)
 
 
+@pytest.mark.parametrize(("write", "read"), [(write_pcd, read_pcd), (write_ply, read_ply)])
 @pytest.mark.parametrize("count", [0, 1, 65_537, 140_000])
-def test_pcd_reads_back_what_was_written(tmp_path, count):
+def test_what_was_written_is_read_back(tmp_path, count, write, read):
     points, colors = some_points(count)
-    write_pcd(tmp_path / "a.pcd", points, colors)
-    got_points, got_colors = read_pcd(tmp_path / "a.pcd")
+    write(tmp_path / "a", points, colors)
+    got_points, got_colors = read(tmp_path / "a")
     np.testing.assert_array_equal(got_points, points)
     np.testing.assert_array_equal(got_colors, colors)
 
