@@ -17,7 +17,6 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
-from vislam.core.streams import Happening
 from vislam.datasets.formats.truth import Truth
 from vislam.datasets.images import (
     DepthFormat,
@@ -36,9 +35,8 @@ from vislam.trajectory import Trajectory
 
 STEREO_TOLERANCE_NS = 2_000_000  # at 1 m/s the body moves 2 mm in it, far less than any baseline
 DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
-_FRAME_GAP_S = 0.5  # a hole in the images that is worth reporting, unless frames are rarer anyway
-_USUAL_PERIODS = 3.5  # a hole is longer than this many usual periods
-_NAMED_GAPS = 5  # gaps reported one by one
+FRAME_HOLE_S = 0.5  # of images, that is worth reporting
+IMU_HOLE_S = MachineConfig().max_gap_s  # spans are interpolated over shorter ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +84,10 @@ class Streams(Protocol):
 
     def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> Loader:
         """Return what loads the images of frames, of the first `cameras` only if given."""
+        ...
+
+    def repeats(self, camera: int) -> Iterator[bool]:
+        """Yield for each image of a camera but the first whether it equals the one before to the byte."""
         ...
 
 
@@ -157,7 +159,7 @@ def image_list(
     name: str, folder: Path, rows: Iterable[Row[str]], problems: Problems, rate_hz: float | None = None
 ) -> ImageList:
     """Return the images of one camera from the rows of its list, in time order; bad rows are counted."""
-    kept = list(in_time_order(rows, problems, name))
+    kept = list(in_time_order(rows, problems, name, hole_s=FRAME_HOLE_S, rate_hz=rate_hz or 0.0))
     stamps = np.array([row[0] for row in kept], dtype=np.int64)
     return ImageList(name, folder, stamps, tuple(row[1] for row in kept), rate_hz)
 
@@ -218,7 +220,7 @@ class FileRecording:
         self._frames = frame_table(survey, self._counter)
         self._known = dict(self._counter)
         judges = survey.problems.judges.values()
-        self._steps_ns = [e.from_ns for j in judges for e in j.events if e.happening is Happening.STEP_BACK]
+        self._steps_ns = [event.from_ns for judge in judges for event in judge.events if event.tears]
         self.problems: dict[str, int] = self._counter
         self.frame_count = len(self._frames.t_ns)
         if not self.frame_count:
@@ -280,7 +282,7 @@ class FileRecording:
                     continue
 
     def _read_frames(self, from_ns: int | None) -> Generator[Frame, None, None]:
-        gaps, last_ns = _GapWatch("image", gap_limit_s(self._frames.t_ns), self._counter), None
+        last_ns = None
         with closing(open_loader(self._survey, self.rig, self._frames, self.cameras_read)) as loader:
             index = 0 if from_ns is None else int(np.searchsorted(self._frames.t_ns, from_ns))
             with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers)) as decoded:
@@ -288,7 +290,6 @@ class FileRecording:
                     if loaded.trouble is not None:
                         self._counter.count(loaded.trouble.kind, self._place(loaded.trouble.path))
                     if loaded.images:
-                        gaps.see(t_ns)
                         lag_s = self._depth_lag_s(index)
                         is_torn = last_ns is not None and any(last_ns <= step_ns < t_ns for step_ns in self._steps_ns)
                         yield Frame(
@@ -309,11 +310,9 @@ class FileRecording:
         if not self._survey.has_imu:
             return
         rate_hz = self.imu_noise.rate_hz if self.imu_noise is not None else 0.0
-        gaps = _GapWatch("imu", imu_gap_limit_s(rate_hz), self._counter)
         calibration = self._survey.imu_calibration
         rows = self._survey.imu_rows(self._counter)
-        for t_ns, values in in_time_order(rows, self._counter, "imu"):
-            gaps.see(t_ns)
+        for t_ns, values in in_time_order(rows, self._counter, "imu", hole_s=IMU_HOLE_S, rate_hz=rate_hz):
             both = np.array(values)
             sample = ImuSample(t_ns, both[:3], both[3:])
             yield sample if calibration is None else calibration.apply(sample)
@@ -328,32 +327,3 @@ class FileRecording:
 
     def _place(self, path: Path) -> str:
         return str(path.relative_to(self._survey.root)) if path.is_relative_to(self._survey.root) else path.name
-
-
-def gap_limit_s(t_ns: NDArray[np.int64]) -> float:
-    """Return how long a hole between these frame stamps is usual: several of their own periods, or half a second."""
-    period_s = float(np.median(np.diff(t_ns))) * 1e-9 if len(t_ns) > 1 else 0.0
-    return max(_FRAME_GAP_S, _USUAL_PERIODS * period_s)
-
-
-def imu_gap_limit_s(rate_hz: float) -> float:
-    """Return how long a hole between inertial samples is usual: what spans are interpolated over, or a few periods."""
-    return max(MachineConfig().max_gap_s, _USUAL_PERIODS / rate_hz if rate_hz > 0.0 else 0.0)
-
-
-class _GapWatch:
-    """Reports gaps of one stream: the first few one by one, the others as a count."""
-
-    def __init__(self, what: str, limit_s: float, problems: Problems) -> None:
-        self._what = what
-        self._limit_ns = round(limit_s * 1e9)
-        self._problems = problems
-        self._last_ns: int | None = None
-        self._reported = 0
-
-    def see(self, t_ns: int) -> None:
-        if self._last_ns is not None and t_ns - self._last_ns > self._limit_ns:
-            self._reported += 1
-            gap = f"{self._what} gap of {(t_ns - self._last_ns) * 1e-9:.2f} s at t={self._last_ns * 1e-9:.3f} s"
-            self._problems.count(gap if self._reported <= _NAMED_GAPS else f"further {self._what} gaps")
-        self._last_ns = t_ns

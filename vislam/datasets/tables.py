@@ -14,7 +14,7 @@ from typing import IO, TypeVar
 
 from vislam.core.errors import DataError
 from vislam.core.reading import open_file
-from vislam.core.streams import StreamJudge
+from vislam.core.streams import Happening, StreamJudge
 
 T = TypeVar("T")
 Row = tuple[int, T]  # stamp in ns, and what the row holds
@@ -24,6 +24,8 @@ MAX_FILE_BYTES = 2**30  # of tables that are indexed in memory: 4 days of images
 _MAX_STAMP_NS = 2**62
 _ENOUGH_ROWS = 20  # below this many rows, one bad line in two is not yet "mostly unusable"
 _MANY_ROWS = 1000  # bad rows, and more than good ones, settle it
+_NAMED_GAPS = 5  # of a stream, one by one
+_STREAMS = {"imu": "imu0", "mag": "mag0"}  # as events name them
 _LEAP_NS = 1_000_000_000  # a stamp that leaps further ahead than this, and back in the next row, is the wrong one
 
 
@@ -190,35 +192,47 @@ def check_size(path: Path, limit_bytes: int) -> None:
         raise DataError(f"{path} has {size} bytes, more than the {limit_bytes} allowed; split the recording")
 
 
-def in_time_order(rows: Iterable[Row[T]], problems: Problems, what: str, keep_equal: bool = False) -> Iterator[Row[T]]:
+def in_time_order(
+    rows: Iterable[Row[T]],
+    problems: Problems,
+    what: str,
+    keep_equal: bool = False,
+    hole_s: float = 0.0,
+    rate_hz: float = 0.0,
+) -> Iterator[Row[T]]:
     """Yield rows with strictly rising stamps, or with `keep_equal` stamps that do not fall; drop and count the others.
 
     A stamp that goes back is dropped, unless the stamp before it had leapt ahead: then that one is the wrong one, and
-    dropping it saves everything behind it.
+    dropping it saves everything behind it. Holes are counted where `hole_s` says which are worth it; `rate_hz` is the
+    stated rate, if any.
     """
-    judge = problems.judges[what] = StreamJudge(what)
+    judge = problems.judges[what] = StreamJudge(_STREAMS.get(what, what), hole_s=hole_s, rate_hz=rate_hz)
     last_ns: int | None = None
     held: Row[T] | None = None
     for row in rows:
-        t_ns = row[0]
+        t_ns, numbers = row[0], row[1] if isinstance(row[1], list) else ()
         if held is None or t_ns > held[0] or (keep_equal and t_ns == held[0]):
             if held is not None:
                 yield held
                 last_ns = held[0]
             held = row
-            judge.takes(t_ns)
+            judge.takes(t_ns, numbers)
         elif t_ns == held[0]:
-            judge.takes(t_ns)
+            judge.takes(t_ns, numbers)
             problems.count(f"{what}: duplicate stamp", f"{t_ns} ns")
         elif (last_ns is None or t_ns > last_ns) and held[0] - t_ns > _LEAP_NS:
             problems.count(f"{what}: stamp that leaps ahead", f"{held[0]} ns")
             held = row
             judge.correct(t_ns)
         else:
-            judge.takes(t_ns)
+            judge.takes(t_ns, numbers)
             problems.count(f"{what}: backward stamp", f"{t_ns} ns")
     if held is not None:
         yield held
+    holes = [event for event in judge.events if hole_s and event.happening is Happening.HOLE]
+    for k, hole in enumerate(holes):
+        gap = f"gap of {(hole.to_ns - hole.from_ns) * 1e-9:.2f} s at t={hole.from_ns * 1e-9:.3f} s"
+        problems.count(f"{judge.stream}: {gap if k < _NAMED_GAPS else 'further gaps'}")
 
 
 def _lines(path: Path, problems: Problems) -> Iterator[tuple[int, str, bool]]:

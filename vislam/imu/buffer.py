@@ -9,7 +9,7 @@ import numpy as np
 from vislam.config import ImuConfig, MachineConfig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import ImuSample, ImuSpan
-from vislam.core.streams import StreamEvent
+from vislam.core.streams import Happening, StreamEvent
 from vislam.imu.noise_floor import NoiseFloor
 from vislam.imu.series import ImuSeries
 
@@ -29,11 +29,10 @@ class ImuBuffer:
         """Start empty; with a noise model the spans have what the samples show against it."""
         self.noise_floor = None if noise is None else NoiseFloor(noise)
         self.outages = 0
-        self._series = ImuSeries(max_gap_s=machine.max_gap_s)
+        self._series = ImuSeries(max_gap_s=machine.max_gap_s, rate_hz=0.0 if noise is None else noise.rate_hz)
         self._buffer_ns = round(config.buffer_s * _NS)
         self._max_gap_ns = round(machine.max_gap_s * _NS)
         self._samples = 0
-        self._gaps = 0
         self._forget_at_ns = 0
 
     @property
@@ -49,7 +48,8 @@ class ImuBuffer:
     @property
     def counters(self) -> dict[str, int]:
         """What was taken, refused and missing so far."""
-        return {"samples": self._samples, **self._series.judge.refused, "gaps": self._gaps}
+        gaps = sum(event.happening is Happening.HOLE for event in self.events)
+        return {"samples": self._samples, **self._series.judge.refused, "gaps": gaps}
 
     @property
     def events(self) -> list[StreamEvent]:
@@ -58,12 +58,9 @@ class ImuBuffer:
 
     def add(self, sample: ImuSample) -> bool:
         """Take a sample; False, and a counter, if it is no measurement or not newer than the last."""
-        newest = self._series.newest_t_ns
         if not self._series.append(sample):
             return False
         self._samples += 1
-        if newest is not None and sample.t_ns - newest > self._max_gap_ns:
-            self._gaps += 1
         if self.noise_floor is not None:
             self.noise_floor.add(sample)
         if sample.t_ns >= self._forget_at_ns:  # now and then: forgetting costs more than taking in

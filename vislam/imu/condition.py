@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.messages import Array, ImuSample
+from vislam.core.streams import Happening, StreamEvent, StreamJudge
 
 _NS = 1_000_000_000
 _WINDOW, _AGAIN = 256, 96  # samples looked at together, and how many of them again in the next window
 _HOLE = 2.5  # usual intervals; a longer one is a hole
 _COARSE_STEPS = 8.0  # of the sensor's resolution
+_AXES = [f"{unit} {axis}" for unit in ("gyro", "accelerometer") for axis in "xyz"]
 _BY_CHANCE = 1e-3  # plateaus at the end of the range that chance would make in the whole recording
 
 
@@ -24,6 +28,7 @@ class InertialCondition:
     longest_gap_s: float
     saturated_axes: tuple[str, ...]  # "gyro x", ...: the range ends where the motion does not
     force_m_s2: float  # median norm of the mean force over short windows: gravity, where motion goes to and fro
+    events: tuple[StreamEvent, ...] = ()  # when the range ended
 
 
 class ConditionWatch:
@@ -33,12 +38,13 @@ class ConditionWatch:
         """Start empty."""
         self._pending: list[Array] = []  # [6] each
         self._last_t_ns: int | None = None
+        self._times_ns: list[int] = []  # of them
         self._intervals_ns: list[int] = []  # one per window: its median
-        self._window_ns: list[int] = []
         self._longest_ns = 0
         self._samples = 0
         self._forces: list[float] = []
         self._ends = np.stack([np.full(6, np.inf), np.full(6, -np.inf)])  # lowest and highest value per axis ...
+        self._clips = [[StreamJudge("")] * 6 for _ in "<>"]  # ... when
         self._runs = np.zeros((2, 6), dtype=np.int64)  # ... and the longest run of it that a motion was cut off by
         self._steps = np.full(6, np.inf)  # smallest change: what the sensor resolves
         self._equal = np.zeros(6, dtype=np.int64)  # pairs of neighbours that are exactly equal
@@ -46,26 +52,33 @@ class ConditionWatch:
     def add(self, sample: ImuSample) -> None:
         """Take a sample, in time order."""
         if self._last_t_ns is not None:
-            step_ns = sample.t_ns - self._last_t_ns
-            self._window_ns.append(step_ns)
-            self._longest_ns = max(self._longest_ns, step_ns)
+            self._longest_ns = max(self._longest_ns, sample.t_ns - self._last_t_ns)
         self._last_t_ns = sample.t_ns
         self._samples += 1
+        self._times_ns.append(sample.t_ns)
         self._pending.append(np.concatenate([sample.gyro_rad_s, sample.accel_m_s2]))
         if len(self._pending) == _WINDOW:
-            self._look(np.array(self._pending))
-            self._pending, self._window_ns = self._pending[-_AGAIN:], []
+            self._look(np.array(self._times_ns), np.array(self._pending))
+            self._pending, self._times_ns = self._pending[-_AGAIN:], self._times_ns[-_AGAIN:]
 
     def condition(self) -> InertialCondition:
         """Return what there is to say so far."""
         interval_ns = float(np.median(self._intervals_ns)) if self._intervals_ns else float("nan")
         longest_ns = self._longest_ns if self._longest_ns > _HOLE * interval_ns else 0
         force = float(np.median(self._forces)) if self._forces else float("nan")
-        return InertialCondition(self._samples, _NS / interval_ns, longest_ns / _NS, self._saturated(), force)
+        axes = self._saturated()
+        events = [
+            e
+            for clips in self._clips
+            for name, judge in zip(_AXES, clips, strict=True)
+            if name in axes
+            for e in judge.events
+        ]
+        return InertialCondition(self._samples, _NS / interval_ns, longest_ns / _NS, axes, force, tuple(events))
 
-    def _look(self, values: Array) -> None:
-        """Take a window [N, 6] that begins within the one before."""
-        self._intervals_ns.append(int(np.median(self._window_ns)))
+    def _look(self, t_ns: NDArray[np.int64], values: Array) -> None:
+        """Take times [N] and values [N, 6] of a window that begins within the one before."""
+        self._intervals_ns.append(int(np.median(np.diff(t_ns))))
         self._forces.append(float(np.linalg.norm(values[:, 3:].mean(axis=0))))
         changes = np.abs(np.diff(values, axis=0))
         self._equal += np.sum(changes == 0.0, axis=0)
@@ -74,7 +87,13 @@ class ConditionWatch:
             beyond = ends < self._ends[0] if side == 0 else ends > self._ends[1]
             runs = np.where(ends == self._ends[side], self._runs[side], 0)
             for axis in np.flatnonzero(beyond | (ends == self._ends[side])):
-                runs[axis] = max(int(runs[axis]), _cut_off(values[:, axis], ends[axis], self._steps[axis]))
+                if beyond[axis]:
+                    self._clips[side][axis] = StreamJudge(f"imu0 {_AXES[axis]}")
+                for begin, stop in _cut_off(values[:, axis], ends[axis], self._steps[axis]):
+                    runs[axis] = max(int(runs[axis]), stop - begin)
+                    if stop - begin > 1 and (stop >= _AGAIN or len(self._forces) == 1):  # else it was seen before
+                        times_ns = int(t_ns[begin]), int(t_ns[stop - 1])
+                        self._clips[side][axis].note(Happening.CLIPPED, *times_ns, stop - begin)
             self._runs[side] = np.where(beyond, runs, np.maximum(runs, self._runs[side]))
             self._ends[side] = np.where(beyond, ends, self._ends[side])
 
@@ -84,21 +103,18 @@ class ConditionWatch:
             return ()
         share = (self._equal + 1.0) / self._samples
         expected = self._samples * share ** np.maximum(self._runs.max(axis=0) - 1, 0)
-        names = [f"{unit} {axis}" for unit in ("gyro", "accelerometer") for axis in "xyz"]
-        return tuple(name for name, chance in zip(names, expected, strict=True) if chance < _BY_CHANCE)
+        return tuple(name for name, chance in zip(_AXES, expected, strict=True) if chance < _BY_CHANCE)
 
 
-def _cut_off(values: Array, end: float, step: float) -> int:
-    """Return the longest run of `end` in [N] that a motion was cut off by; 0: none.
+def _cut_off(values: Array, end: float, step: float) -> Iterator[tuple[int, int]]:
+    """Yield where runs of `end` in [N] that a motion was cut off by begin and stop.
 
     A smooth peak in a sensor's coarse steps stays at its highest for a while, too; but half that long before, it was
     three steps lower, and a motion that is cut off was much farther away.
     """
     is_there = values == end
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_there, [False]]).astype(np.int8)))
-    longest = 0
     for begin, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         before = begin - max((stop - begin) // 2, 1)
         if before >= 0 and abs(values[before] - end) > _COARSE_STEPS * step:
-            longest = max(longest, stop - begin)
-    return longest
+            yield begin, stop

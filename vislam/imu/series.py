@@ -23,12 +23,13 @@ class ImuSeries:
         judge: which samples are taken, and what happened in the stream.
     """
 
-    def __init__(self, extra: int = 0, max_gap_s: float = 0.0) -> None:
+    def __init__(self, extra: int = 0, max_gap_s: float = 0.0, rate_hz: float = 0.0) -> None:
         """Start empty.
 
         Args:
             extra: the number of further columns that a user keeps beside each sample, NaN at first.
             max_gap_s: shorter ones are no holes.
+            rate_hz: the stated one; 0: none is.
         """
         self._t_ns: NDArray[np.int64] = np.empty(_FIRST_CAPACITY, dtype=np.int64)
         self._values: Array = np.empty((_FIRST_CAPACITY, 6))
@@ -36,7 +37,7 @@ class ImuSeries:
         self._begin = 0
         self._end = 0
         self._newest_t_ns = -(1 << 62)
-        self.judge = StreamJudge("imu0", MOST, max_gap_s)
+        self.judge = StreamJudge("imu0", MOST, max_gap_s, rate_hz)
 
     def __len__(self) -> int:
         """Return the number of samples held."""

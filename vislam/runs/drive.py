@@ -314,8 +314,7 @@ class Run:
     def _metrics(
         self, final: Trajectory, truth: Trajectory | None, wall_s: float, loops: dict[str, int]
     ) -> dict[str, Any]:
-        front, back = self.slam.front.report(), self.slam.back
-        front = replace(front, events=self._input.among(front.events))
+        front, back = self._input.among(self.slam.front.report()), self.slam.back
         stamps, timing_ms = self.log.stamps_ns, self.slam.clock.summary_ms()
         part = stamps[self._first_frame :]
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}

@@ -92,7 +92,7 @@ def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
     lasted_s = (event.to_ns - event.from_ns) * 1e-9
     is_gone = event.happening in (Happening.STUCK, Happening.UNUSABLE) and lasted_s > max_gap_s
-    return is_gone or event.happening is Happening.STEP_BACK
+    return is_gone or event.tears
 
 
 def _together(events: Sequence[StreamEvent], begin_ns: int) -> Iterator[str]:

@@ -26,6 +26,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import HardwareError, StorageError, UsageError
 from vislam.core.files import write_text
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.streams import Happening, StreamEvent, StreamJudge
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.recorder import Recorder
@@ -38,6 +39,7 @@ from vislam.hw.library_cameras import gives_frames, open_frame_camera, open_with
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
+from vislam.imu.series import MOST
 from vislam.runs.camera_rig import rig_of
 from vislam.runs.recorded_readings import FurtherPorts, ReadingRecorder
 
@@ -47,6 +49,7 @@ _WRITE_S = 0.05  # inertial samples wait at most so long for an image that does 
 _TOLD_S = 1.0  # between looks at the free space, and lines of progress
 _JOIN_S = 2.0
 _FIRST_IMAGE_S = 5.0
+_NAMED_EVENTS = 10  # one by one, to a person
 Images = Webcam | VideoCamera | LibraryCamera[CapturedImage] | LibraryCamera[Frame]
 Shot = CapturedImage | Frame
 # x forward, y left, z up of the body, for a camera that looks ahead: x right, y down, z forward
@@ -64,6 +67,7 @@ class Recorded:
     bytes_written: int = 0
     health: Health = field(default_factory=lambda: Health(0))  # every bit that was ever set
     faults: dict[str, dict[str, int]] = field(default_factory=dict)  # counters of each sensor
+    events: list[dict[str, Any]] = field(default_factory=list)  # what happened in the streams, once it is over
     notes: tuple[str, ...] = ()  # what a user should know: settings that the camera refused, missing calibrations
     ended: str = ""
 
@@ -184,6 +188,9 @@ class _Recording:
         self._health = [Health(0), Health(0)]  # of the inertial thread and of the camera's
         self._is_stopping = threading.Event()
         self._images_ended = threading.Event()
+        rate_hz = 0.0 if inertial is None else inertial.rate_hz
+        self._judges = {"imu0": StreamJudge("imu0", MOST, rate_hz=rate_hz), "cam0": StreamJudge("cam0")}
+        self._first_ns, self._shown = recorded.began_ns, np.empty((0, 0), dtype=np.uint8)
         self._began_utc = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
     def run(self, first: Shot | None, seconds: float | None, progress: Callable[[Recorded], None] | None) -> Recorded:
@@ -196,6 +203,7 @@ class _Recording:
         ]
         try:
             if first is not None:
+                self._first_ns = first.t_ns
                 self._write_frame(first)
             for thread in threads:
                 thread.start()
@@ -216,6 +224,9 @@ class _Recording:
                 self._write_waiting(0.0)
             if self._readings is not None:
                 recorded.notes += self._readings.notes()
+            events = [event for judge in self._judges.values() for event in judge.events]
+            recorded.events = [event.entry(self._first_ns, _done(event)) for event in events]
+            recorded.notes += tuple(event.words(self._first_ns, _done(event)) for event in events[:_NAMED_EVENTS])
         except StorageError as error:
             recorded.ended = str(error)
             with suppress(StorageError, OSError):  # what went wrong first is what is reported
@@ -272,7 +283,10 @@ class _Recording:
         if self._readings is not None:
             self._readings.take()
         for _ in range(self._samples.qsize()):
-            self._recorder.write(self._samples.get_nowait())
+            sample = self._samples.get_nowait()
+            if isinstance(sample, ImuSample):
+                self._judges["imu0"].takes(sample.t_ns, [*sample.gyro_rad_s.tolist(), *sample.accel_m_s2.tolist()])
+            self._recorder.write(sample)
         try:
             image = self._frames.get(timeout=wait_s) if wait_s > 0.0 else self._frames.get_nowait()
         except Empty:
@@ -280,13 +294,18 @@ class _Recording:
         self._write_frame(image)
 
     def _write_frame(self, image: Shot) -> None:
-        if isinstance(image, Frame):
-            self._recorder.write(image)
-            return
-        is_color = image.image.ndim == 3
-        grey = cv2.cvtColor(image.image, cv2.COLOR_BGR2GRAY) if is_color else image.image
-        color = image.image if is_color else None
-        self._recorder.write(Frame(image.t_ns, image.index, (np.asarray(grey, dtype=np.uint8),), color))
+        if not isinstance(image, Frame):
+            is_color = image.image.ndim == 3
+            grey = cv2.cvtColor(image.image, cv2.COLOR_BGR2GRAY) if is_color else image.image
+            color = image.image if is_color else None
+            image = Frame(image.t_ns, image.index, (np.asarray(grey, dtype=np.uint8),), color)
+        judge, shown = self._judges["cam0"], image.images[0]
+        if judge.takes(image.t_ns):
+            judge.look(shown, image.t_ns, image.t_ns)
+            if np.array_equal(shown, self._shown):
+                judge.note(Happening.REPEATED, image.t_ns, image.t_ns)
+        self._shown = shown
+        self._recorder.write(image)
 
     def _why_end(self, seconds: float | None) -> str:
         """Return why the recording ends now, empty if it goes on."""
@@ -332,6 +351,10 @@ class _Recording:
         if isinstance(self._images, Webcam | LibraryCamera):
             data["camera_settings"] = [asdict(setting) for setting in self._images.settings]
         write_text(recorded.folder / "recording.json", json.dumps(data, indent=1) + "\n")
+
+
+def _done(event: StreamEvent) -> str:
+    return "left out" if event.stream == "cam0" and event.is_out_of_order else "written as it came"
 
 
 def _check_space(out: Path, config: RecordConfig) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from vislam.core.errors import DataError
@@ -10,8 +11,10 @@ from vislam.core.memory import FrontMemory
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.core.recording import Recording
-from vislam.core.streams import Happening, StreamEvent, StreamJudge
+from vislam.core.streams import together
+from vislam.datasets.tables import Problems
 from vislam.pipeline.dark import dark
+from vislam.pipeline.front_report import FrontReport
 from vislam.runs.further_sensors import FurtherReadings
 from vislam.sensors import Suite
 
@@ -35,14 +38,12 @@ class RunInput:
         """What could not be read so far, with how often."""
         return {**self._recording.problems, **({} if self._further is None else self._further.problems)}
 
-    def among(self, events: Iterable[StreamEvent]) -> tuple[StreamEvent, ...]:
-        """Return events with what happened so far to stamps as they are recorded, in the order of time.
-
-        Holes in them are what the run has for holes, too.
-        """
-        judges: dict[str, StreamJudge] = getattr(self._recording.problems, "judges", {})
-        own = [e for judge in judges.values() for e in judge.events if e.happening is not Happening.HOLE]
-        return tuple(sorted([*events, *own], key=lambda event: event.from_ns))
+    def among(self, report: FrontReport) -> FrontReport:
+        """Return a report whose events are all there are: also of clipped axes, and of stamps as they are recorded."""
+        events = report.events + (() if report.condition is None else report.condition.events)
+        problems = self._recording.problems
+        judges = problems.judges.values() if isinstance(problems, Problems) else ()
+        return replace(report, events=tuple(together(events, judges)))
 
     def values(self, front: FrontMemory | None) -> Iterator[ImuSample | MagSample | Frame | Reading]:
         """Yield all values, or those from the newest keyframe of an earlier process on, and some samples before it.

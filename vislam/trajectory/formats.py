@@ -5,8 +5,10 @@ A damaged line is an error with its file and line, never a pose that is quietly 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,10 @@ from vislam.core.files import write_text
 from vislam.core.geometry import quaternion_xyzw_from_rotation
 from vislam.core.messages import Array
 from vislam.core.reading import open_file
+from vislam.core.streams import Happening, StreamJudge
 from vislam.core.trajectory import Trajectory
 
+_LOG = logging.getLogger(__name__)
 _MAX_BYTES = 512 * 2**20  # ten million poses; a larger file is not a trajectory
 _MAX_LINE_BYTES = 16_384  # a state line with its covariance has about 3000
 _MAX_STAMP_NS = 2**62
@@ -31,7 +35,8 @@ _ROTATION_TOLERANCE = 1e-3  # KITTI files round to 7 digits
 def read_tum(path: Path) -> Trajectory:
     """Read a TUM file: `t tx ty tz qx qy qz qw` in seconds and metres, `#` starts a comment.
 
-    Raises DataError with file and line on a damaged line, a zero quaternion, NaN or a backward stamp.
+    Raises DataError with file and line on a damaged line, a zero quaternion, NaN or a backward stamp; of poses of one
+    time the first is taken, as a run does.
     """
     stamps, numbers, lines = read_table(path, separator=None, columns=(8,))
     t_ns = np.array([stamp_ns(text, 1e9, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
@@ -176,6 +181,11 @@ def _read_kitti_times(path: Path) -> NDArray[np.int64]:
 
 
 def _trajectory(t_ns: NDArray[np.int64], positions: Array, q_xyzw: Array, path: Path, lines: list[int]) -> Trajectory:
+    judge = StreamJudge(path.name)
+    is_new = np.array([judge.takes(t) for t in t_ns.tolist()], dtype=bool)
+    if judge.refused[Happening.DUPLICATE] and not judge.refused[Happening.LATE]:
+        _LOG.warning("%s", "; ".join(e.words(int(t_ns[0])) for e in judge.events if e.happening is Happening.DUPLICATE))
+        t_ns, positions, q_xyzw, lines = t_ns[is_new], positions[is_new], q_xyzw[is_new], list(compress(lines, is_new))
     _check_increasing(t_ns, path, lines)
     _check_reach(positions, path, lines)
     norms = np.linalg.norm(q_xyzw, axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,17 @@ class BagStreams:
         """Return what loads the images of frames, of the first `cameras` only if given."""
         return BagLoader(self._bag, frames, self._cameras[:cameras], self._depth, rig)
 
+    def repeats(self, camera: int) -> Iterator[bool]:
+        """Yield for each image of a camera but the first whether it equals the one before to the byte."""
+        topic, before = self._cameras[camera], b""
+        for row in range(len(topic.t_ns)):
+            data = b""
+            with suppress(UnreadableImageError):  # which is reported elsewhere
+                data = _message(self._bag, topic, row)[0].data.tobytes()
+            if row:
+                yield data == before != b""
+            before = data
+
 
 class BagLoader:
     """Loads frames from the messages of a bag."""
@@ -113,22 +125,23 @@ class BagLoader:
         """Nothing is held that the recording does not hold."""
 
     def _grey_or_color(self, topic: ImageTopic, row: int, camera: Camera) -> tuple[ImageU8, ImageU8 | None]:
-        message, path = self._message(topic, row)
+        message, path = _message(self._bag, topic, row)
         if topic.compressed:
             return pictures.unpacked_grey_or_color(message, camera, path)
         return pictures.grey_or_color(message, camera, path)
 
     def _depth_m(self, topic: ImageTopic, row: int) -> ImageF32:
-        message, path = self._message(topic, row)
+        message, path = _message(self._bag, topic, row)
         camera = self._rig.cameras[0]
         return (pictures.unpacked_depth_m if topic.compressed else pictures.depth_m)(message, camera, path)
 
-    def _message(self, topic: ImageTopic, row: int) -> tuple[Any, Path]:
-        path = self._bag.path / topic.topic.name.strip("/") / str(int(topic.t_ns[row]))
-        try:
-            return decoded(topic.topic, self._bag.read(Place(*topic.places[row].tolist()))), path
-        except (DamagedError, OSError) as error:
-            raise UnreadableImageError("image message that cannot be read", path) from error
+
+def _message(bag: Bag, topic: ImageTopic, row: int) -> tuple[Any, Path]:
+    path = bag.path / topic.topic.name.strip("/") / str(int(topic.t_ns[row]))
+    try:
+        return decoded(topic.topic, bag.read(Place(*topic.places[row].tolist()))), path
+    except (DamagedError, OSError) as error:
+        raise UnreadableImageError("image message that cannot be read", path) from error
 
 
 def messages_of(bag: Bag, topic: Topic, problems: Problems) -> Iterator[tuple[Found, Any]]:

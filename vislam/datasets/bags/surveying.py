@@ -35,7 +35,7 @@ from vislam.datasets.formats.truth import Truth, trajectory_of
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_files import read_noise
 from vislam.datasets.plausibility import imu_facts, unit_doubt
-from vislam.datasets.stream import KnownCamera, Survey, TopicSummary
+from vislam.datasets.stream import FRAME_HOLE_S, KnownCamera, Survey, TopicSummary
 from vislam.datasets.tables import Problems, Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
@@ -150,7 +150,7 @@ def _images(facts: ImageFacts, name: str, problems: Problems) -> tuple[ImageList
     """Return the list of a camera's images, and where they lie, in time order."""
     t_ns, places = facts.entry.stamps_and_places()
     rows: Iterator[Row[int]] = zip(t_ns.tolist(), range(len(t_ns)), strict=True)
-    kept = np.array([row for _, row in in_time_order(rows, problems, name)], dtype=np.int64)
+    kept = np.array([row for _, row in in_time_order(rows, problems, name, hole_s=FRAME_HOLE_S)], dtype=np.int64)
     topic = ImageTopic(facts.entry.topic, facts.compressed, t_ns[kept], places[kept])
     return ImageList(name, Path(facts.name.strip("/")), topic.t_ns, tuple(map(str, topic.t_ns.tolist()))), topic
 
