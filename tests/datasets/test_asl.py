@@ -187,8 +187,8 @@ def test_gaps_pass_through_and_are_told(tmp_path: Path) -> None:
     assert len(frames_of(recording)) == 40
     t0 = BEGIN_NS * 1e-9
     assert recording.problems == {
-        f"imu gap of 1.02 s at t={t0 + 1.0:.3f} s": 1,
-        f"image gap of 3.05 s at t={t0 + 18 * 0.05:.3f} s": 1,
+        f"imu0: gap of 1.02 s at t={t0 + 1.0:.3f} s": 1,
+        f"cam0: gap of 3.05 s at t={t0 + 18 * 0.05:.3f} s": 1,
     }
 
 

@@ -433,3 +433,22 @@ def test_units_that_cannot_be_are_refused(
     with pytest.raises(DataError, match=words):
         open_dataset(str(path), noise)
     assert open_dataset(f"bag:{path},imu=none").imu_noise is None
+
+
+@pytest.mark.parametrize("is_packed", [False, True])
+def test_frozen_and_dark_images_of_a_bag_are_named_as_those_of_a_folder(tmp_path: Path, is_packed: bool) -> None:
+    types = types_of("mcap")
+    topic = "/cam0/image_raw/compressed" if is_packed else "/cam0/image_raw"
+    messages = [Message(BEGIN_NS, "/cam0/camera_info", types.info(BEGIN_NS, (WIDTH, HEIGHT), K, "plumb_bob", []))]
+    for i in range(60):
+        t_ns = BEGIN_NS + i * FRAME_NS
+        image = np.full((HEIGHT, WIDTH), i % 2, np.uint8) if 40 <= i < 50 else picture(9 if 10 <= i < 20 else i)
+        data = cv2.imencode(".png", image)[1].tobytes()
+        packed = types.compressed(t_ns, data, "png") if is_packed else types.image(t_ns, image, "mono8")
+        messages.append(Message(t_ns, topic, packed))
+    result = inspect(str(write_bag(tmp_path, "mcap", messages)))
+    said = [finding.what for finding in result.findings if finding.severity == "warning"]
+    assert any(what.startswith("cam0: images that equal the one before from 0.50 to 0.95 s (10)") for what in said), (
+        said
+    )
+    assert any(what.startswith("cam0: dark images from 2.00 to 2.50 s (10)") for what in said), said

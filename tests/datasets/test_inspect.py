@@ -1,5 +1,6 @@
 """The doctor: every fault is found and told, and no damage gives a traceback."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -95,12 +96,60 @@ def test_stuck_samples_and_frozen_and_dark_images_are_named_with_their_times(tmp
     assert told(result, "warning", "cam0: dark images from 2.00 to 2.50 s (10)")
 
 
+def written(root: Path, rows: list[tuple[float, list[float]]]) -> Path:
+    """A recording of 12 s whose IMU has the given rows, with times in seconds since the first frame."""
+    mav0 = write_asl(root, frames=240, stereo=False)
+    lines = [f"{BEGIN_NS + round(t_s * 1e9)}," + ",".join(map(repr, values)) for t_s, values in rows]
+    (mav0 / "imu0" / "data.csv").write_text("#t\n" + "\n".join(lines) + "\n")
+    return root
+
+
+@pytest.mark.parametrize(
+    ("changed", "what", "at_s"),
+    [
+        (lambda t, _: max(t, 5.3) if 5.0 < t < 5.3 else t, "rows that came together have stamps of their arrival", 5.0),
+        (lambda t, _: t if t < 5 else (t * 0.699 + 1.505) // 1e-3 * 1e-3, "stamps are rounded, or set right", 5.0),
+        (lambda t, _: t + 3.0 * (t > 5.0), "the clock stepped forth by", 5.0),
+        (lambda t, _: t - 3.0 * (t > 5.0), "the clock stepped back by", 5.0),
+        (lambda t, k: t - 6.0 * (k >= 1200), "played again from its first row, back by", 6.0),
+        (lambda t, _: t + 500.0 * (t > 5.0), "another log follows, off by 500.0", 5.0),
+    ],
+)  # fmt: skip
+def test_what_happens_to_the_clock_of_the_imu_is_named_with_its_time(tmp_path: Path, changed, what: str, at_s: float):
+    rng = np.random.default_rng(5)
+    values = [[*rng.normal(0.0, 0.01, 3), 0.0, rng.normal(0.0, 0.1), 9.81] for _ in range(1200)] * 2
+    rows = [(changed(k * 0.005, k), list(map(float, row))) for k, row in enumerate(values)]
+    result = inspect(str(written(tmp_path, rows)))
+    (said,) = [f.what for f in result.findings if f.what.startswith(f"imu0: {what}") and f.severity == "warning"]
+    assert float(re.search(r"(?:from|at) ([\d.]+)", said)[1]) == pytest.approx(at_s, abs=0.1)
+
+
+def test_clipped_axes_and_images_out_of_focus_are_named_with_their_times(tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    t_s = np.arange(0.0, 12.0, 0.005)
+    gyro = np.column_stack([3.0 * np.sin(2.0 * t_s) * (np.abs(t_s - 6.0) < 1.6) + rng.normal(0.0, 0.01, len(t_s))] * 3)
+    gyro[:, 0] = np.minimum(gyro[:, 0], 2.0)
+    rows = [(float(t), [*map(float, w), 0.0, 0.0, 9.81]) for t, w in zip(t_s, gyro, strict=True)]
+    root = written(tmp_path, rows)
+    images = sorted((root / "mav0" / "cam0" / "data").glob("*.png"))
+    for path in images[100:160]:
+        cv2.imwrite(str(path), cv2.GaussianBlur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (0, 0), 4.0))
+    result = inspect(str(root))
+    (clip,) = [f.what for f in result.findings if "the range ends where the motion does not" in f.what]
+    begin_s, end_s = (float(text) for text in clip.split("from ")[1].split(" s ")[0].split(" to "))
+    true_s = t_s[gyro[:, 0] == 2.0]
+    assert (begin_s, end_s) == pytest.approx((true_s[0], true_s[-1]), abs=0.1)
+    assert clip.startswith("imu0 gyro x: ")
+    assert told(result, "warning", "cam0: images blurred all over from 5.00 to 8.00 s (60)")
+
+
 def test_rates_units_and_clocks_that_do_not_fit(tmp_path: Path) -> None:
     root = write_asl(tmp_path, frames=10, stereo=False)
-    rows = [f"{BEGIN_NS + 10**12 + i * 50_000_000},0,0,60.0,0,0,9.81" for i in range(30)]
+    rows = [f"{BEGIN_NS + 10**12 + i * 50_000_000},0,0,60.0,0,0,9.81" for i in range(80)]
     (root / "imu0" / "data.csv").write_text("#t\n" + "\n".join(rows) + "\n")
     result = inspect(str(tmp_path))
-    assert told(result, "warning", "imu0: 20.0 Hz, but its sensor file states 200.0 Hz")
+    assert told(result, "ok", "imu0: 80 at 20.0 Hz")
+    assert told(result, "warning", "imu0: another rate than the stated one from 1000.00 to 1003.10 s")
     assert told(result, "warning", "only 20 Hz of IMU")
     assert told(result, "error", "the unit seems to be deg/s")
     assert told(result, "error", "no frame lies within the time of the IMU")

@@ -166,7 +166,7 @@ def test_a_clock_that_steps_back_is_named_and_what_follows_is_tied_to_nothing_be
     source = open_source(str(tmp_path / "room"))
     metrics = run(source, tmp_path / "run", map__enabled=False, imu__enabled=imu)
     steps = {event["stream"]: event for event in metrics["events"] if event["happening"] == "step back"}
-    assert {"cam0", "imu"} <= set(steps)
+    assert {"cam0", "imu0"} <= set(steps)
     assert all(abs(event["from_s"] - 4.0) < 0.15 and abs(event["to_s"] - 3.0) < 0.15 for event in steps.values())
     assert "the clock stepped back" in metrics["verdict"]["reasons"][0]
     assert metrics["counters"]["front"]["submaps"] == 2

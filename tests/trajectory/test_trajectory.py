@@ -270,7 +270,6 @@ GOOD = "1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n"
         (GOOD + "3.0 nan 0 0 0 0 0 1\n", "poses.tum:3: NaN"),
         (GOOD + "3.0 0 0 0 0 0 0 0\n", "poses.tum:3: quaternion has norm 0"),
         (GOOD + "1.5 0 0 0 0 0 0 1\n", "poses.tum:3: time stamp"),
-        (GOOD + "2.0 0 0 0 0 0 0 1\n", "poses.tum:3: time stamp"),
         (GOOD + "3.0 0 0 0 0 0", "poses.tum:3: expected 8 columns, got 6"),
         (GOOD + "x 0 0 0 0 0 0 1\n", "poses.tum:3: 'x' is not a time stamp"),
         (GOOD + "1e999 0 0 0 0 0 0 1\n", "out of range"),
@@ -287,6 +286,13 @@ def test_damaged_tum_files_name_their_line(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(DataError, match=message):
         read_tum(path)
+
+
+def test_of_poses_of_one_time_the_first_is_taken_as_a_run_does_and_that_is_said(tmp_path, caplog):
+    path = tmp_path / "poses.tum"
+    path.write_text(GOOD + "2.0 5 5 5 0 0 0 1\n3.0 0 0 0 0 0 0 1\n")
+    assert read_tum(path).positions_m[:, 0].tolist() == [0.0, 0.0, 0.0]
+    assert "poses.tum: rows of a time that was there already from 1.00 to 1.00 s (1); left out" in caplog.text
 
 
 def test_other_unreadable_files(tmp_path):

@@ -26,7 +26,7 @@ _ALIKE = 0.05  # of the usual interval: intervals of one length
 _UNEVEN = 0.25  # of the usual interval: differences of stamps that are worth a word
 _OFF = 0.1  # of a stated rate
 _UNRELATED_NS = 60 * _NS  # a clock that is set anew is seldom off by more; another log is
-_EVERY_PX = 8  # one row and column of an image in so many tells how sharp it is
+_EVERY_PX = 8  # two rows and columns of an image in so many tell how sharp it is
 _BLURRED = 0.5  # of the usual sharpness, for a second: longer than a turn blurs images
 _SHARP_OF = 101  # images, whose median sharpness is the usual one
 _MOST_EVENTS = 50  # of one kind; what comes later is counted with the last
@@ -69,6 +69,9 @@ class Happening(StrEnum):
         return made
 
 
+_OF_STAMPS = (Happening.BURST, Happening.SAWTOOTH, Happening.WRONG_RATE, Happening.APPENDED)
+
+
 @dataclass(frozen=True, slots=True)
 class StreamEvent:
     """What happened in a stream: from the first row concerned to the last one, and what was done about it.
@@ -82,11 +85,6 @@ class StreamEvent:
     from_ns: int
     to_ns: int
     rows: int
-
-    @property
-    def is_out_of_order(self) -> bool:
-        """Whether only the stamps as recorded show it: a run gets its rows in order."""
-        return self.to_ns < self.from_ns or self.happening in (Happening.DUPLICATE, Happening.LATE)
 
     @property
     def tears(self) -> bool:
@@ -115,11 +113,18 @@ def is_dark(image: ImageU8) -> bool:
 
 
 def together(events: Iterable[StreamEvent], recorded: Collection[StreamJudge]) -> list[StreamEvent]:
-    """Return events of streams of one clock with those that only the stamps as recorded show, in the order of time.
+    """Return events of streams of one clock, of their stamps as they are recorded where they are, in the order of time.
 
     A hole in a stream that ends later than another one by as much is a step of its clock: until then they look alike.
     """
-    known = [*events, *(event for judge in recorded for event in judge.events if event.is_out_of_order)]
+    kept = (Happening.HOLE, Happening.STUCK)  # as a run meets them
+    known = [event for judge in recorded for event in judge.events if event.happening not in kept]
+    begun = {(event.stream, event.from_ns) for event in known}
+    streams = [judge.stream for judge in recorded]
+    for event in events:
+        is_known = event.happening is Happening.HOLE and (event.stream, event.from_ns) in begun
+        if not is_known and not (event.stream in streams and event.happening in _OF_STAMPS):
+            known.append(event)
     spans = {judge.stream: judge.span for judge in recorded if judge.span is not None}
     for k, hole in enumerate(known):
         if hole.happening is Happening.HOLE and hole.stream in spans:
@@ -378,13 +383,16 @@ class _Pace:
 
 
 def _sharpness(image: ImageU8) -> float:
-    """Return how much the slope of an image [H, W] changes by the pixel, over the slope, in the sharper direction.
+    """Return how much the slope of an image [H, W] changes by two pixels, over the slope, in the sharper direction.
 
-    Contrast does not change it, a Gaussian blur divides it by its width, and motion blurs one direction only.
+    Contrast does not change it, a Gaussian blur divides it by its width, motion blurs one direction only, and noise,
+    which is no sharpness, is less in the mean of four pixels.
     """
     found = []
-    for lines in (image[::_EVERY_PX], image[:, ::_EVERY_PX].T):
-        slopes = np.diff(lines.astype(np.int16), axis=1)
+    for lines in (image, image.T):
+        whole = lines[: len(lines) // _EVERY_PX * _EVERY_PX, : lines.shape[1] // 2 * 2]
+        pairs = whole[::_EVERY_PX].astype(np.int16) + whole[1::_EVERY_PX]
+        slopes = np.diff(pairs[:, ::2] + pairs[:, 1::2], axis=1)
         total = float(np.abs(slopes[:, 1:] + slopes[:, :-1]).sum())
         found.append(float(np.abs(np.diff(slopes, axis=1)).sum()) / max(total, 1.0))
     return max(found)

@@ -112,7 +112,7 @@ class _Inspector:
         self._findings: list[Finding] = [Finding("error", str(error), str(found.root)) for error in found.errors]
         self._findings += [Finding("warning", str(error), str(found.root)) for error in found.lacking.values()]
         self._streams: list[StreamSummary] = []
-        self._checks = StreamChecks(problems, found.imu_noise)
+        self._checks = StreamChecks(problems)
         self._size_bytes = found.streams.size_bytes if found.streams is not None else 0
 
     def run(self, uri: str) -> Inspection:
@@ -221,7 +221,9 @@ class _Inspector:
 
     def _rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         calibration = self._found.imu_calibration
-        for t_ns, values in in_time_order(self._found.imu_rows(problems), problems, "imu", hole_s=IMU_HOLE_S):
+        rate_hz = 0.0 if self._found.imu_noise is None else self._found.imu_noise.rate_hz
+        rows = in_time_order(self._found.imu_rows(problems), problems, "imu", hole_s=IMU_HOLE_S, rate_hz=rate_hz)
+        for t_ns, values in rows:
             yield t_ns, values if calibration is None else calibration.apply_to(np.array([values]))[0].tolist()
 
     def _check_imu(self) -> ImuFacts | None:

@@ -13,7 +13,7 @@ from vislam.core.messages import ImageU8, ImuSample
 from vislam.core.streams import Happening, StreamJudge, together
 from vislam.datasets.images import ImageList
 from vislam.datasets.tables import Problems, Row
-from vislam.imu import ConditionWatch, ImuNoise
+from vislam.imu import ConditionWatch
 from vislam.imu.series import MOST
 
 _FEW = 3  # images or rows that are worth no warning
@@ -30,15 +30,15 @@ _STEPS = {
 class StreamChecks:
     """Owns a judge of each stream that was looked at; `findings` has what they found."""
 
-    def __init__(self, problems: Problems, noise: ImuNoise | None) -> None:
-        """Take the judges of the stamps of streams, and the stated noise of the IMU."""
-        self._problems, self._rate_hz = problems, 0.0 if noise is None else noise.rate_hz
+    def __init__(self, problems: Problems) -> None:
+        """Take the judges of the stamps of streams."""
+        self._problems = problems
         self._judges = dict(problems.judges)
         self._condition = ConditionWatch()
 
     def watched(self, rows: Iterable[Row[list[float]]]) -> Iterator[Row[list[float]]]:
         """Yield inertial rows (rates, forces), all of them, after the judge has seen them."""
-        judge = self._judges["imu0"] = StreamJudge("imu0", MOST, rate_hz=self._rate_hz)
+        judge = self._judges["imu0"] = StreamJudge("imu0", MOST)
         for t_ns, values in rows:
             if judge.takes(t_ns, values):
                 six = np.array(values)

@@ -193,13 +193,9 @@ def check_size(path: Path, limit_bytes: int) -> None:
 
 
 def in_time_order(
-    rows: Iterable[Row[T]],
-    problems: Problems,
-    what: str,
-    keep_equal: bool = False,
-    hole_s: float = 0.0,
+    rows: Iterable[Row[T]], problems: Problems, what: str, keep_equal: bool = False, hole_s: float = 0.0,
     rate_hz: float = 0.0,
-) -> Iterator[Row[T]]:
+) -> Iterator[Row[T]]:  # fmt: skip
     """Yield rows with strictly rising stamps, or with `keep_equal` stamps that do not fall; drop and count the others.
 
     A stamp that goes back is dropped, unless the stamp before it had leapt ahead: then that one is the wrong one, and

@@ -89,7 +89,8 @@ class ConditionWatch:
             for axis in np.flatnonzero(beyond | (ends == self._ends[side])):
                 if beyond[axis]:
                     self._clips[side][axis] = StreamJudge(f"imu0 {_AXES[axis]}")
-                for begin, stop in _cut_off(values[:, axis], ends[axis], self._steps[axis]):
+                seen = [int(np.searchsorted(t_ns, e.to_ns)) for e in self._clips[side][axis].events[-1:]]
+                for begin, stop in _cut_off(values[:, axis], ends[axis], self._steps[axis], *seen):
                     runs[axis] = max(int(runs[axis]), stop - begin)
                     if stop - begin > 1 and (stop >= _AGAIN or len(self._forces) == 1):  # else it was seen before
                         times_ns = int(t_ns[begin]), int(t_ns[stop - 1])
@@ -106,15 +107,15 @@ class ConditionWatch:
         return tuple(name for name, chance in zip(_AXES, expected, strict=True) if chance < _BY_CHANCE)
 
 
-def _cut_off(values: Array, end: float, step: float) -> Iterator[tuple[int, int]]:
+def _cut_off(values: Array, end: float, step: float, seen: int = -1) -> Iterator[tuple[int, int]]:
     """Yield where runs of `end` in [N] that a motion was cut off by begin and stop.
 
     A smooth peak in a sensor's coarse steps stays at its highest for a while, too; but half that long before, it was
-    three steps lower, and a motion that is cut off was much farther away.
+    three steps lower, and a motion that is cut off was much farther away. Those up to `seen` were found before.
     """
     is_there = values == end
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_there, [False]]).astype(np.int8)))
     for begin, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         before = begin - max((stop - begin) // 2, 1)
-        if before >= 0 and abs(values[before] - end) > _COARSE_STEPS * step:
+        if begin <= seen or (before >= 0 and abs(values[before] - end) > _COARSE_STEPS * step):
             yield begin, stop

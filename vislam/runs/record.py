@@ -354,7 +354,9 @@ class _Recording:
 
 
 def _done(event: StreamEvent) -> str:
-    return "left out" if event.stream == "cam0" and event.is_out_of_order else "written as it came"
+    return (
+        "left out" if event.stream == "cam0" and event.happening.done.startswith("left out") else "written as it came"
+    )
 
 
 def _check_space(out: Path, config: RecordConfig) -> None:
