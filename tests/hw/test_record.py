@@ -240,6 +240,23 @@ def test_stamps_beside_a_video_are_taken(video: Path, sensors: SensorsConfig, tm
     assert [frame.t_ns - frames[0].t_ns for frame in frames] == [int(row) - 5_000 for row in rows]
 
 
+def test_what_happens_in_the_streams_is_written_beside_them_and_told(sensors: SensorsConfig, tmp_path: Path) -> None:
+    path, rng = tmp_path / "wall.avi", np.random.default_rng(3)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (WIDTH, HEIGHT))
+    wall = cv2.resize(rng.integers(0, 255, (24, 32, 3), dtype=np.uint8), (WIDTH, HEIGHT))
+    for k in range(60):
+        image = np.clip(wall + rng.normal(0.0, 3.0, wall.shape), 0, 255).astype(np.uint8)
+        writer.write(np.zeros_like(wall) if 20 <= k < 30 else wall if 40 <= k < 45 else image)
+    writer.release()
+    path.with_suffix(".csv").write_text("#t\n" + "".join(f"{k * 50_000_000 + 10**10}\n" for k in range(60)))
+    recorded = record(tmp_path / "r", "none", str(path), sensors, CONFIG, in_real_time=False)
+    events = json.loads((tmp_path / "r" / "recording.json").read_text())["events"]
+    found = [(e["stream"], e["happening"], e["from_s"], e["to_s"], e["done"]) for e in events]
+    assert ("cam0", "dark", 1.0, 1.45, "written as it came") in found
+    assert ("cam0", "repeated", 2.05, 2.2, "written as it came") in found
+    assert any("cam0: dark images from 1.00 to 1.45 s (10); written as it came" in note for note in recorded.notes)
+
+
 def test_a_budget_ends_it_in_time(video: Path, sensors: SensorsConfig, tmp_path: Path) -> None:
     recorded = record(
         tmp_path / "r", "none", str(video), sensors,

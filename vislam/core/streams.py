@@ -25,8 +25,8 @@ _FEWEST = 3  # that make a burst, or a pattern in a window of intervals
 _ALIKE = 0.05  # of the usual interval: intervals of one length
 _UNEVEN = 0.25  # of the usual interval: differences of stamps that are worth a word
 _OFF = 0.1  # of a stated rate
-_UNRELATED_NS = 60 * _NS  # a clock that is set anew is seldom off by more; another log is
-_EVERY_PX = 8  # two rows and columns of an image in so many tell how sharp it is
+_UNRELATED_NS = 60 * _NS  # a clock that is set again is seldom off by more; another log is
+_EVERY_PX = 8  # of which two rows and columns are looked at, for how sharp an image is
 _BLURRED = 0.5  # of the usual sharpness, for a second: longer than a turn blurs images
 _SHARP_OF = 101  # images, whose median sharpness is the usual one
 _MOST_EVENTS = 50  # of one kind; what comes later is counted with the last
@@ -88,7 +88,7 @@ class StreamEvent:
 
     @property
     def tears(self) -> bool:
-        """Whether it parts what came before from what came after by a time that nobody knows."""
+        """Whether it parts what came before from what came after by an unknown time."""
         return self.happening in (Happening.STEP_BACK, Happening.LOOPED, Happening.APPENDED)
 
     def entry(self, begin_ns: int, done: str = "") -> dict[str, Any]:
@@ -151,7 +151,7 @@ class StreamJudge:
         self.refused: dict[str, int] = dict.fromkeys(map(str, kinds), 0)
         self.stream, self._most = stream, most
         self._newest_ns: int | None = None
-        self._first: list[tuple[int, Sequence[float]]] = []  # rows with their times, as far as a loop is told by them
+        self._first: list[tuple[int, Sequence[float]]] = []  # rows with their times, that begin a loop again
         self._is_refused = False  # what came since then, so that a hole behind it has a name already
         self._behind: list[tuple[int, Sequence[float]]] = []  # rows behind the newest, as far as they rise
         self._step = Happening.STEP_BACK  # what they are, when they are many
@@ -161,7 +161,7 @@ class StreamJudge:
         self._events: dict[Happening, list[StreamEvent]] = {}
         self._pace = _Pace(self, round(hole_s * _NS), rate_hz)
         self._sharp: deque[float] = deque(maxlen=_SHARP_OF)  # of the newest images, blurred ones left out
-        self._blur = 0, 0, 0  # since when images are, how many, and how many of them were told of
+        self._blur = 0, 0, 0  # since when images are, how many, and how many of them were noted
 
     @property
     def events(self) -> list[StreamEvent]:
@@ -213,11 +213,11 @@ class StreamJudge:
             self._sharp.append(sharp)
             self._blur = 0, 0, 0
             return None
-        since_ns, images, told = self._blur if self._blur[1] else (from_ns, 0, 0)
+        since_ns, images, noted = self._blur if self._blur[1] else (from_ns, 0, 0)
         if images + 1 >= _STEP_ROWS and to_ns - since_ns >= _NS:
-            self.note(Happening.BLURRED, since_ns, to_ns, images + 1 - told)
-            told = images + 1
-        self._blur = since_ns, images + 1, told
+            self.note(Happening.BLURRED, since_ns, to_ns, images + 1 - noted)
+            noted = images + 1
+        self._blur = since_ns, images + 1, noted
         return None
 
     def correct(self, t_ns: int) -> None:
@@ -254,7 +254,7 @@ class StreamJudge:
         return False
 
     def _kind_of_step(self) -> Happening:
-        """Tell a loop and another log from a clock that was set back, by where the rows behind the newest begin."""
+        """Return whether rows behind the newest are a loop, another log, or a clock that was set back."""
         if self._behind == self._first:
             return Happening.LOOPED
         early_ns = self._first[0][0] - self._behind[0][0]

@@ -199,8 +199,8 @@ def in_time_order(
     """Yield rows with strictly rising stamps, or with `keep_equal` stamps that do not fall; drop and count the others.
 
     A stamp that goes back is dropped, unless the stamp before it had leapt ahead: then that one is the wrong one, and
-    dropping it saves everything behind it. Holes are counted where `hole_s` says which are worth it; `rate_hz` is the
-    stated rate, if any.
+    dropping it saves everything behind it. Holes longer than `hole_s` are counted, if given; `rate_hz` is the stated
+    rate, if any.
     """
     judge = problems.judges[what] = StreamJudge(_STREAMS.get(what, what), hole_s=hole_s, rate_hz=rate_hz)
     last_ns: int | None = None
