@@ -94,8 +94,10 @@ def test_a_stream_of_nothing_but_events_stays_small() -> None:
     assert sum(event.rows for event in judge.events) == 400
 
 
-def judged(times_ns: list[int], rows: list[list[float]] | None = None, hole_s: float = 0.0, rate_hz: float = 0.0):
-    judge = StreamJudge("imu0", (), hole_s, rate_hz)
+def judged(
+    times_ns: list[int], rows: list[list[float]] | None = None, hole_s: float = 0.0, rate_hz: float = 0.0, recorded=True
+) -> StreamJudge:
+    judge = StreamJudge("imu0", (), hole_s, rate_hz, recorded)
     for k, t_ns in enumerate(times_ns):
         judge.takes(t_ns, () if rows is None else rows[k])
     return judge
@@ -209,6 +211,8 @@ def test_playback_that_begins_again_is_told_from_a_clock_that_steps_back_and_fro
     assert kinds(judged([t + day_ns for t in times] + times, [*rows, *others]))[0] == ("appended", 86404.995, 0.0)
     later = judged([*times, *(t + day_ns for t in times)], [*rows, *others], hole_s=0.1)
     assert kinds(later) == [("appended", 4.995, 86400.0)]
+    live = judged([*times, *(t + day_ns for t in times)], [*rows, *others], 0.1, recorded=False)
+    assert kinds(live) == [("hole", 4.995, 86400.0)]
     assert all(event.tears for event in later.events)
     assert "another log follows, off by 86395.0" in later.events[0].words(0)
     back = [t - 2_000_000_000 for t in times]

@@ -3,13 +3,17 @@
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 
 from vislam.core.messages import Frame, ImuSample
-from vislam.datasets import open_dataset
+from vislam.core.streams import Happening
+from vislam.datasets import open_dataset, survey
 from vislam.datasets.inspect import inspect
+from vislam.datasets.stream_checks import StreamChecks
+from vislam.datasets.tables import Problems, in_time_order
 
 pytestmark = pytest.mark.data
 
@@ -76,3 +80,24 @@ def test_inertial_recordings_are_inspected(data_root: Path) -> None:
 def test_the_doctor_tells_how_truth_fits_the_imu(data_root: Path) -> None:
     result = inspect(str(data_root / "euroc_v202_imu"))
     assert any("truth is turned by 0.6" in finding.what for finding in result.findings)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["euroc_mh01_17s", "euroc_v101_imu", "euroc_v201_imu", "euroc_v202_imu", "tumvi_room1_imu", "tum_fr1_desk",
+     "hololens_000"],
+)  # fmt: skip
+def test_nothing_happens_in_the_streams_of_clean_recordings(data_root: Path, name: str) -> None:
+    found, problems = survey(str(data_root / name)), Problems()
+    problems.judges |= found.problems.judges
+    checks = StreamChecks(problems)
+    if found.has_imu:
+        rate_hz = 0.0 if found.imu_noise is None else found.imu_noise.rate_hz
+        assert len(list(checks.watched(in_time_order(found.imu_rows(problems), problems, "imu", rate_hz=rate_hz)))) > 0
+    for images in found.cameras:
+        for k in range(0, len(images.files) - 3, 3):
+            grey = cv2.imread(str(images.path(k)), cv2.IMREAD_GRAYSCALE)
+            checks.look_at(images.name, grey, int(images.t_ns[k]), int(images.t_ns[k + 3]))
+    assert problems.judges
+    assert checks.findings(0) == []
+    assert all(event.happening is Happening.HOLE for judge in problems.judges.values() for event in judge.events)

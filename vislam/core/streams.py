@@ -145,8 +145,13 @@ class StreamJudge:
         refused: rows that are no measurement of a time of their own, by what happened.
     """
 
-    def __init__(self, stream: str, most: Sequence[float] = (), hole_s: float = 0.0, rate_hz: float = 0.0) -> None:
-        """Begin with no row: `most` are limits of its numbers, `rate_hz` is stated, holes below `hole_s` are none."""
+    def __init__(
+        self, stream: str, most: Sequence[float] = (), hole_s: float = 0.0, rate_hz: float = 0.0, recorded: bool = False
+    ) -> None:
+        """Begin with no row; a stream that is `recorded` may be several logs in one.
+
+        `most` are limits of the numbers of a row, `rate_hz` is the stated rate, holes below `hole_s` are none.
+        """
         kinds = (Happening.UNUSABLE, Happening.DUPLICATE, Happening.LATE, Happening.STUCK)
         self.refused: dict[str, int] = dict.fromkeys(map(str, kinds), 0)
         self.stream, self._most = stream, most
@@ -159,7 +164,7 @@ class StreamJudge:
         self._run, self._run_ns, self._is_stuck = 0, 0, False  # rows equal to the one before them, and since when
         self._pairs, self._equal = 0, 0  # of neighbours, those that were stuck left out
         self._events: dict[Happening, list[StreamEvent]] = {}
-        self._pace = _Pace(self, round(hole_s * _NS), rate_hz)
+        self._pace = _Pace(self, round(hole_s * _NS), rate_hz, recorded)
         self._sharp: deque[float] = deque(maxlen=_SHARP_OF)  # of the newest images, blurred ones left out
         self._blur = 0, 0, 0  # since when images are, how many, and how many of them were noted
 
@@ -292,12 +297,12 @@ def _joined(known: list[StreamEvent], event: StreamEvent) -> list[StreamEvent]:
 class _Pace:
     """Owns the newest intervals of a stream: which one is usual, and what the others say."""
 
-    def __init__(self, judge: StreamJudge, hole_ns: int, rate_hz: float) -> None:
+    def __init__(self, judge: StreamJudge, hole_ns: int, rate_hz: float, recorded: bool) -> None:
         self.usual_ns = 0  # before there are enough
         self.pause: tuple[int, int, int] | None = None  # times around it and of the newest row, until it is named ...
         self.hurried = 0  # ... by the rows close behind it
         self.shared = 0  # rows since the last look that had the stamp of the one before, and other numbers
-        self._judge, self._hole_ns, self._rate_hz = judge, hole_ns, rate_hz
+        self._judge, self._hole_ns, self._rate_hz, self._recorded = judge, hole_ns, rate_hz, recorded
         self._steps_ns: list[int] = []  # since the last look ...
         self._before_ns: list[int] = []  # ... and up to it
         self._looked_ns = 0
@@ -312,7 +317,7 @@ class _Pace:
         missing = round((to_ns - from_ns) / self.usual_ns) - 1
         if self.hurried + 1 >= max(_FEWEST, missing / 2):
             return Happening.BURST, from_ns, newest_ns, self.hurried + 1
-        is_log = to_ns - from_ns > max(_UNRELATED_NS, from_ns - self._judge.span[0])
+        is_log = self._recorded and to_ns - from_ns > max(_UNRELATED_NS, from_ns - self._judge.span[0])
         kind = Happening.APPENDED if is_log else Happening.HOLE
         return (kind, from_ns, to_ns, missing) if to_ns - from_ns > self._hole_ns else None
 

@@ -202,7 +202,7 @@ def in_time_order(
     dropping it saves everything behind it. Holes longer than `hole_s` are counted, if given; `rate_hz` is the stated
     rate, if any.
     """
-    judge = problems.judges[what] = StreamJudge(_STREAMS.get(what, what), hole_s=hole_s, rate_hz=rate_hz)
+    judge = problems.judges[what] = StreamJudge(_STREAMS.get(what, what), hole_s=hole_s, rate_hz=rate_hz, recorded=True)
     last_ns: int | None = None
     held: Row[T] | None = None
     for row in rows:
