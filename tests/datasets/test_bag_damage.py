@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame
+from vislam.core.recording import Problems
 from vislam.datasets import open_dataset
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES
 from vislam.datasets.inspect import inspect
-from vislam.datasets.tables import Problems
 from worlds.bag_writer import Message, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, HEIGHT, WIDTH, picture
 

@@ -16,10 +16,10 @@ from vislam.cli import run_verb
 from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.inspect import inspect
-from vislam.datasets.tables import Problems
 from worlds.bag_writer import KINDS, Message, Types, from_asl, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, HEIGHT, IMU_YAML, WIDTH, picture, write_asl
 

@@ -10,11 +10,11 @@ import pytest
 
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.messages import Frame, ImuSample
+from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.inspect import inspect
 from vislam.datasets.loaders import VideoLoader
 from vislam.datasets.sensor_files import sensor_readings
-from vislam.datasets.tables import Problems
 from vislam.datasets.telemetry import later_chapters, open_joined
 from vislam.sensors.toml import load_sensor_setup
 from worlds import gopro

@@ -18,11 +18,11 @@ from vislam.cli import run_verb
 from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame
+from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.stored import DamagedError
 from vislam.datasets.sensor_files import sensor_readings
-from vislam.datasets.tables import Problems
 from vislam.sensors import load_sensor_setup
 from worlds import foxglove_writer as writer
 from worlds.bag_writer import Message, from_asl, types_of, write_bag

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from vislam.calibration.inertial.tables import read_inertial
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame, ImuSample
+from vislam.core.recording import Problems
 from vislam.datasets import open_dataset
 from vislam.datasets.inspect import inspect
 from vislam.datasets.sensor_files import local_frame, sensor_readings
-from vislam.datasets.tables import Problems
 from vislam.datasets.telemetry import frame_times_ns, open_telemetry
 from vislam.datasets.telemetry.klv import read_streams
 from vislam.datasets.telemetry.mp4 import read_tracks

@@ -9,11 +9,12 @@ import pytest
 import yaml
 
 from vislam.core.messages import Frame, ImuSample
+from vislam.core.recording import Problems
 from vislam.core.streams import Happening
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.inspect import inspect
 from vislam.datasets.stream_checks import StreamChecks
-from vislam.datasets.tables import Problems, in_time_order
+from vislam.datasets.tables import in_time_order
 
 pytestmark = pytest.mark.data
 

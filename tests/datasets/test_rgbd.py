@@ -15,6 +15,7 @@ from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Frame
+from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.calibration import DepthFile, parse_depth
 from vislam.datasets.images import DepthFormat
@@ -23,7 +24,6 @@ from vislam.datasets.recorder import record
 from vislam.datasets.rgbd import RgbdFacts, rgbd_facts, rgbd_faults
 from vislam.datasets.rgbd.facts import OddValue, odd_values
 from vislam.datasets.stream import frame_table
-from vislam.datasets.tables import Problems
 from vislam.sim import open_world
 from vislam.sim.motion.path import wander
 from vislam.sim.motion.spline import BodySpline

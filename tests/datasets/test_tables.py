@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets.tables import (
     MAX_LINE_BYTES,
-    Problems,
     in_time_order,
     parse_ns,
     parse_seconds,

@@ -20,8 +20,8 @@ from vislam.cli import run_verb
 from vislam.config import BridgeClockConfig, RecordConfig, SensorsConfig, SerialConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.readings import Reading
+from vislam.core.recording import Problems
 from vislam.datasets.sensor_files import sensor_readings
-from vislam.datasets.tables import Problems
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.live.port_readings import PortReadings
 from vislam.runs.record import Recorded, record

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from vislam.core.errors import DataError, VislamError
 from vislam.core.readings import Reading
+from vislam.core.recording import Problems
 from vislam.datasets.sensor_files import local_frame, sensor_readings
-from vislam.datasets.tables import Problems
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.gnss import GnssSettings, NmeaFixes, UbxFixes

@@ -8,6 +8,7 @@ from typing import Protocol
 from vislam.core.camera import Rig
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.streams import StreamJudge
 from vislam.core.trajectory import Trajectory
 
 
@@ -51,3 +52,28 @@ class WrappedRecording:
     def truth(self) -> Trajectory | None:
         """Return the recording's truth."""
         return self._recording.truth()
+
+
+class Problems(dict[str, int]):
+    """Counts of what was skipped, by kind; the text of a kind names the place of its first case.
+
+    Attributes:
+        judges: of the stamps of streams, by name: what happened in them, and when.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._keys: dict[str, str] = {}
+        self.judges: dict[str, StreamJudge] = {}
+
+    def count(self, kind: str, where: str = "", times: int = 1) -> None:
+        """Add `times` cases of `kind`; `where` is kept for the first case only."""
+        if times:
+            key = self._keys.setdefault(kind, f"{kind} (first: {where})" if where else kind)
+            self[key] = self.get(key, 0) + times
+
+    def restart(self, known: dict[str, int]) -> None:
+        """Forget what was counted and start from `known`, the counts that every pass shares."""
+        self.clear()
+        self._keys.clear()
+        self.update(known)

@@ -11,13 +11,12 @@ from typing import Protocol
 from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.kinds import Kinds, lacking
-from vislam.core.recording import Recording
+from vislam.core.recording import Problems, Recording
 from vislam.datasets import bags
 from vislam.datasets.calibrated import calibrated, with_imu_rate
 from vislam.datasets.formats import asl, kitti, phone, tum, video
 from vislam.datasets.sensor_files import sensor_readings
 from vislam.datasets.stream import FileRecording, Survey
-from vislam.datasets.tables import Problems
 
 __all__ = ["READERS", "FileRecording", "Problems", "Reader", "Survey", "open_dataset", "sensor_readings", "survey"]
 

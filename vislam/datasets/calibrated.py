@@ -12,11 +12,11 @@ import numpy as np
 from vislam.config import CalibrationConfig, Config
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets.calibration import DepthFile, load_yaml, parse_depth
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.stream import KnownCamera, Survey, with_depth_format
-from vislam.datasets.tables import Problems
 
 _OFFSET_WIDER = 3.0  # sigmas of a calibrated time offset that a later day may be off
 _LEAST_OFFSET_SIGMA_S = 0.001

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from vislam.config import MachineConfig
-from vislam.datasets.tables import Problems, Row
+from vislam.core.recording import Problems
+from vislam.datasets.tables import Row
 
 Rows = Iterator[Row[list[float]]]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding, Severity, worst
+from vislam.core.recording import Problems
 from vislam.datasets import survey as survey_recording
 from vislam.datasets.camera_turns import fit_turns, follow_turns, turn_findings, turn_places
 from vislam.datasets.images import (
@@ -38,7 +39,7 @@ from vislam.datasets.plausibility import (
 from vislam.datasets.rgbd import rgbd_findings
 from vislam.datasets.stream import IMU_HOLE_S, Survey, TopicSummary, frame_table, open_loader
 from vislam.datasets.stream_checks import StreamChecks, repeats
-from vislam.datasets.tables import Problems, Row, in_time_order
+from vislam.datasets.tables import Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
 from vislam.trajectory.truth_fit import fit_truth

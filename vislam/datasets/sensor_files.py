@@ -13,15 +13,8 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.core.reading import open_file
 from vislam.core.readings import Reading
-from vislam.datasets.tables import (
-    MAX_LINE_BYTES,
-    Problems,
-    Row,
-    in_time_order,
-    parse_ns,
-    parse_seconds,
-    read_rows,
-)
+from vislam.core.recording import Problems
+from vislam.datasets.tables import MAX_LINE_BYTES, Row, in_time_order, parse_ns, parse_seconds, read_rows
 from vislam.datasets.telemetry import open_joined
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import LocalFrame

@@ -17,6 +17,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.recording import Problems
 from vislam.datasets.formats.truth import Truth
 from vislam.datasets.images import (
     DepthFormat,
@@ -29,7 +30,7 @@ from vislam.datasets.images import (
 )
 from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoader
-from vislam.datasets.tables import Problems, Row, in_time_order, read_numbers
+from vislam.datasets.tables import Row, in_time_order, read_numbers
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.trajectory import Trajectory
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from vislam.core.findings import Finding
 from vislam.core.messages import ImageU8, ImuSample
+from vislam.core.recording import Problems
 from vislam.core.streams import Happening, StreamJudge, together
 from vislam.datasets.images import ImageList
-from vislam.datasets.tables import Problems, Row
+from vislam.datasets.tables import Row
 from vislam.imu import ConditionWatch
 from vislam.imu.series import MOST
 

@@ -14,6 +14,7 @@ from typing import IO, TypeVar
 
 from vislam.core.errors import DataError
 from vislam.core.reading import open_file
+from vislam.core.recording import Problems
 from vislam.core.streams import Happening, StreamJudge
 
 T = TypeVar("T")
@@ -27,31 +28,6 @@ _MANY_ROWS = 1000  # bad rows, and more than good ones, settle it
 _NAMED_GAPS = 5  # of a stream, one by one
 _STREAMS = {"imu": "imu0", "mag": "mag0"}  # as events name them
 _LEAP_NS = 1_000_000_000  # a stamp that leaps further ahead than this, and back in the next row, is the wrong one
-
-
-class Problems(dict[str, int]):
-    """Counts of what was skipped, by kind; the text of a kind names the place of its first case.
-
-    Attributes:
-        judges: of the stamps of streams, by name: what happened in them, and when.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._keys: dict[str, str] = {}
-        self.judges: dict[str, StreamJudge] = {}
-
-    def count(self, kind: str, where: str = "", times: int = 1) -> None:
-        """Add `times` cases of `kind`; `where` is kept for the first case only."""
-        if times:
-            key = self._keys.setdefault(kind, f"{kind} (first: {where})" if where else kind)
-            self[key] = self.get(key, 0) + times
-
-    def restart(self, known: dict[str, int]) -> None:
-        """Forget what was counted and start from `known`, the counts that every pass shares."""
-        self.clear()
-        self._keys.clear()
-        self.update(known)
 
 
 def parse_ns(text: str) -> int:

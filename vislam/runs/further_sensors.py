@@ -12,9 +12,8 @@ from vislam.config import FurtherSensorsConfig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
-from vislam.core.recording import Recording
+from vislam.core.recording import Problems, Recording
 from vislam.datasets.sensor_files import sensor_readings
-from vislam.datasets.tables import Problems
 from vislam.sensors import Suite
 from vislam.sensors.simulated import drawn_readings
 from vislam.sensors.toml import SensorSetup, load_sensor_setup

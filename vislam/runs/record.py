@@ -26,11 +26,12 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import HardwareError, StorageError, UsageError
 from vislam.core.files import write_text
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.recording import Problems
 from vislam.core.streams import Happening, StreamEvent, StreamJudge
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.recorder import Recorder
-from vislam.datasets.tables import Problems, read_frame_stamps
+from vislam.datasets.tables import read_frame_stamps
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.video import VideoCamera
 from vislam.hw.cameras.webcam import Webcam

@@ -10,9 +10,8 @@ from vislam.core.errors import DataError
 from vislam.core.memory import FrontMemory
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
-from vislam.core.recording import Recording
+from vislam.core.recording import Problems, Recording
 from vislam.core.streams import together
-from vislam.datasets.tables import Problems
 from vislam.pipeline.dark import dark
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.further_sensors import FurtherReadings

@@ -90,8 +90,8 @@ def measured_inertial(uri: str) -> MeasuredInertial:
     What the truth's body is turned, displaced and late against the IMU is fitted and undone, where it is beyond chance.
     Raises DataError when it lacks an IMU, its noise or truth.
     """
+    from vislam.core.recording import Problems
     from vislam.datasets import survey
-    from vislam.datasets.tables import Problems
     from vislam.sim import POINT_WORLD_NAMES, MeasuredInertial
     from vislam.trajectory.truth_fit import fit_truth
 
@@ -145,7 +145,8 @@ def shaken(recording: Recording, vibration: VibrationConfig) -> Recording:
 
 def _samples(found: Survey) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return stamps [N] and calibrated samples [N, 6] of a recording with inertial data."""
-    from vislam.datasets.tables import Problems, in_time_order
+    from vislam.core.recording import Problems
+    from vislam.datasets.tables import in_time_order
 
     problems = Problems()
     rows = list(in_time_order(found.imu_rows(problems), problems, "imu"))

@@ -18,12 +18,12 @@ from vislam.calibration.options import RgbdOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets import survey
 from vislam.datasets.calibration import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.rgbd import Known, RgbdFacts, known, rgbd_facts
 from vislam.datasets.stream import Survey, frame_table, with_depth_format
-from vislam.datasets.tables import Problems
 
 _FILES = ("sensor.yaml", "rgbd.png", "rgbd.json")
 _WORTH = 2.0  # sigmas: what is nearer to nothing stays as it was given

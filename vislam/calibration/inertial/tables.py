@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
+from vislam.core.recording import Problems
 from vislam.datasets import survey
 from vislam.datasets.bags import is_bag
-from vislam.datasets.tables import MAX_FILE_BYTES, Problems, Row, check_size, in_time_order, read_numbers
+from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, in_time_order, read_numbers
 from vislam.datasets.telemetry import open_telemetry
 
 _NS = 1e-9

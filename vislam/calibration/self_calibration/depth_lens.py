@@ -14,10 +14,10 @@ from vislam.calibration.self_calibration.certainty import Certainty
 from vislam.calibration.self_calibration.lens_search import Solution, refined
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets import survey
 from vislam.datasets.rgbd import rgbd_facts
 from vislam.datasets.stream import frame_table
-from vislam.datasets.tables import Problems
 from vislam.vision.depth_focal import FocalFit
 
 _WORST = 0.02  # relative sigma: worse is no help

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from vislam.core.errors import DataError
 from vislam.core.reading import open_file
+from vislam.core.recording import Problems
 from vislam.datasets.bags import mcap, rosbag1, sqlite
 from vislam.datasets.bags.chunks import unpacked_message
 from vislam.datasets.bags.stored import HEAD_BYTES, Container, DamagedError, Found, Place
 from vislam.datasets.calibration import load_yaml
-from vislam.datasets.tables import Problems
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _ACTIVE = ".bag.active"  # of a recorder that was killed

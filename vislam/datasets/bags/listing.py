@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.decoding import (
     COMPRESSED,
@@ -21,7 +22,6 @@ from vislam.datasets.bags.decoding import (
     why_unreadable,
 )
 from vislam.datasets.bags.stored import DamagedError, Found, Place, Topic
-from vislam.datasets.tables import Problems
 
 _PLACES_KEPT = 1000  # of transforms
 _FIRST_KEPT = 5  # of all else, as the very first may be damaged

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, Bytes, ChunkedFile, FileBytes
 from vislam.datasets.bags.stored import (
@@ -23,7 +24,6 @@ from vislam.datasets.bags.stored import (
     Topic,
     message_type,
 )
-from vislam.datasets.tables import Problems
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _DATA_END = 2, 3, 4, 5, 6, 8, 15

@@ -11,6 +11,7 @@ import struct
 from collections.abc import Iterator
 
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets.bags.chunks import Bytes, ChunkedFile, FileBytes
 from vislam.datasets.bags.stored import (
     HEAD_BYTES,
@@ -22,7 +23,6 @@ from vislam.datasets.bags.stored import (
     Topic,
     message_type,
 )
-from vislam.datasets.tables import Problems
 
 MAGIC = b"#ROSBAG V2.0\n"
 _CHUNK, _CONNECTION, _MESSAGE = 5, 7, 2

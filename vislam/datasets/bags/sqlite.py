@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from vislam.core.errors import DataError
 from vislam.core.reading import check_file, open_file
+from vislam.core.recording import Problems
 from vislam.datasets.bags.stored import (
     HEAD_BYTES,
     MOST_MESSAGE_BYTES,
@@ -21,7 +22,6 @@ from vislam.datasets.bags.stored import (
     Topic,
     message_type,
 )
-from vislam.datasets.tables import Problems
 
 MAGIC = b"SQLite format 3\0"
 _ERRORS = (sqlite3.Error, ValueError, OverflowError, MemoryError)  # ValueError: of its own message that is no text

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from vislam.datasets.tables import Problems
+from vislam.core.recording import Problems
 
 HEAD_BYTES = 512  # of a message: all of an inertial one, and the header of every other
 MOST_MESSAGE_BYTES = 2**28  # as of an image file

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8
+from vislam.core.recording import Problems
 from vislam.datasets.bags import pictures
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.decoding import decoded
@@ -22,7 +23,7 @@ from vislam.datasets.bags.listing import fitting, stamp
 from vislam.datasets.bags.stored import HEAD_BYTES, DamagedError, Found, Place, Topic
 from vislam.datasets.images import UnreadableImageError
 from vislam.datasets.loaders import FrameTable, LoadedImages
-from vislam.datasets.tables import Problems, Row
+from vislam.datasets.tables import Row
 
 _ENOUGH = 20  # messages, and most of them unusable, settle it
 _UT_PER_TESLA = 1e6

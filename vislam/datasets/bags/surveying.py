@@ -13,6 +13,7 @@ from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
+from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.choice import BagOptions, Choice, ImageFacts, chosen, topics_there
 from vislam.datasets.bags.decoding import (
@@ -36,7 +37,7 @@ from vislam.datasets.images import ImageList
 from vislam.datasets.imu_files import read_noise
 from vislam.datasets.plausibility import imu_facts, unit_doubt
 from vislam.datasets.stream import FRAME_HOLE_S, KnownCamera, Survey, TopicSummary
-from vislam.datasets.tables import Problems, Row, in_time_order
+from vislam.datasets.tables import Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
 

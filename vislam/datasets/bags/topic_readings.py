@@ -12,6 +12,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.readings import Reading
+from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.choice import wanted_topic
 from vislam.datasets.bags.decoding import (
@@ -30,7 +31,6 @@ from vislam.datasets.bags.decoding import (
 )
 from vislam.datasets.bags.listing import Entry, Listing, fitting, stamp
 from vislam.datasets.bags.streams import messages_of
-from vislam.datasets.tables import Problems
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.gnss import Fix, FixReadings

@@ -14,13 +14,14 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
+from vislam.core.recording import Problems
 from vislam.datasets import calibration as files
 from vislam.datasets.calibration import CAMERA_EXAMPLE, DEPTH_UNITS_PER_M, CameraFile
 from vislam.datasets.formats.truth import Truth, asl_truth
 from vislam.datasets.images import DepthFormat, ImageList
 from vislam.datasets.imu_files import imu_calibration, mag_calibration
 from vislam.datasets.stream import Survey, image_list, with_depth_format
-from vislam.datasets.tables import Problems, read_names
+from vislam.datasets.tables import read_names
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 LOOKS_FOR = "mav0/cam0/data.csv"

@@ -23,7 +23,8 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.core.messages import Array, Frame, ImuSample, Observations
 from vislam.core.reading import open_file
-from vislam.datasets.tables import Problems, Row, check_size, in_time_order, parse_seconds, read_rows
+from vislam.core.recording import Problems
+from vislam.datasets.tables import Row, check_size, in_time_order, parse_seconds, read_rows
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
 

@@ -15,10 +15,11 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.core.reading import open_file, read_bytes
+from vislam.core.recording import Problems
 from vislam.datasets.formats.truth import Truth, kitti_truth
 from vislam.datasets.images import ImageList, UnreadableImageError, probe
 from vislam.datasets.stream import Survey
-from vislam.datasets.tables import MAX_FILE_BYTES, Problems, check_size, parse_seconds
+from vislam.datasets.tables import MAX_FILE_BYTES, check_size, parse_seconds
 
 LOOKS_FOR = "calib.txt and times.txt"
 _PAIRS = ((0, 1), (2, 3))  # grey, colour

@@ -25,6 +25,7 @@ from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
 from vislam.core.reading import open_file, read_text
+from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList, check_size_px
 from vislam.datasets.imu_pairs import ImuRows, Rows, paired
@@ -32,7 +33,6 @@ from vislam.datasets.loaders import video_facts
 from vislam.datasets.stream import Survey, image_list
 from vislam.datasets.tables import (
     MAX_LINE_BYTES,
-    Problems,
     Row,
     in_time_order,
     parse_ns,

@@ -13,16 +13,9 @@ import numpy as np
 
 from vislam.core.geometry import rotation_from_quaternion_xyzw
 from vislam.core.messages import Array
+from vislam.core.recording import Problems
 from vislam.datasets.images import Stamps
-from vislam.datasets.tables import (
-    MAX_FILE_BYTES,
-    Problems,
-    Row,
-    check_size,
-    in_time_order,
-    parse_seconds,
-    read_numbers,
-)
+from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, in_time_order, parse_seconds, read_numbers
 from vislam.trajectory import Trajectory, read_kitti
 
 Truth = Callable[[Problems], Trajectory | None]

@@ -16,11 +16,12 @@ import numpy as np
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
+from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, CameraFile, read_camera
 from vislam.datasets.formats.truth import tum_truth
 from vislam.datasets.images import DepthFormat, ImageList
 from vislam.datasets.stream import ForceRows, Survey, image_list, with_depth_format
-from vislam.datasets.tables import Problems, Row, parse_seconds, read_names, read_numbers
+from vislam.datasets.tables import Row, parse_seconds, read_names, read_numbers
 
 LOOKS_FOR = "rgb.txt"
 _DEPTH_UNITS_PER_M = 5000.0

@@ -22,11 +22,12 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
+from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList, check_size_px
 from vislam.datasets.loaders import video_facts
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import Problems, Row, read_frame_stamps
+from vislam.datasets.tables import Row, read_frame_stamps
 from vislam.datasets.telemetry import (
     Film,
     JoinedTelemetry,

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
+from vislam.core.recording import Problems
 from vislam.datasets.imu_pairs import Rows, paired
-from vislam.datasets.tables import Problems, in_time_order
+from vislam.datasets.tables import in_time_order
 from vislam.datasets.telemetry.gpmf_track import Telemetry, open_telemetry
 from vislam.datasets.telemetry.mp4 import Integers, frame_times_ns
 from vislam.sensors.gnss import Fix

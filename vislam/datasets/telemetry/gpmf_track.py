@@ -21,8 +21,9 @@ from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array
 from vislam.core.reading import open_file
+from vislam.core.recording import Problems
 from vislam.datasets.imu_pairs import Rows, paired
-from vislam.datasets.tables import Problems, in_time_order
+from vislam.datasets.tables import in_time_order
 from vislam.datasets.telemetry.klv import Stream, read_streams
 from vislam.datasets.telemetry.mp4 import Track, is_mp4, read_tracks
 from vislam.sensors.geodetic import Geodetic
