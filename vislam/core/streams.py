@@ -192,7 +192,7 @@ class StreamJudge:
         if any(not abs(value) <= most for value, most in zip(row, self._most, strict=False)):  # also what is no number
             return self._refuse(Happening.UNUSABLE, t_ns)
         if newest is not None and t_ns <= newest:
-            if t_ns < newest:
+            if t_ns < newest or self._behind:
                 return self._is_behind(t_ns, row, newest)
             if row != self._last:
                 self._pace.shared += 1

@@ -10,7 +10,7 @@ import numpy as np
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImageU8, Observations
-from vislam.core.streams import Happening, StreamJudge, is_dark
+from vislam.core.streams import Happening, StreamJudge
 
 _DESCRIPTOR_BYTES = 32
 _EVERY_PX = 8  # the image is compared with the one before at one pixel in so many, each way
@@ -113,8 +113,8 @@ class CameraFeed:
         self._last_t_ns = frame.t_ns
         small = frame.images[0][::_EVERY_PX, ::_EVERY_PX].copy() if frame.images else None
         self._is_same = small is not None and self._last is not None and np.array_equal(small, self._last)
-        if small is not None and is_dark(small):
-            self.judge.note(Happening.DARK, frame.t_ns, frame.t_ns)
+        if frame.images:
+            self.judge.look(frame.images[0], frame.t_ns, frame.t_ns)
         self._last = small
 
     def moved(self, at_rest: bool) -> None:
