@@ -10,62 +10,88 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, tee
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
-from vislam.core.messages import Array, Frame, ImageU8, ImuSample, MagSample
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.recording import Recording, WrappedRecording
-from vislam.sim.faults.disturbance import PERSON_M, in_window, person_box
-
-Event = ImuSample | MagSample | Frame
-Stream = Callable[[Iterator[Event], Rig, np.random.Generator], Iterator[Event]]
+from vislam.core.streams import Happening, StreamJudge
+from vislam.core.trajectory import Trajectory
+from vislam.sim.faults import camera_faults as cam
+from vislam.sim.faults import inertial_faults as imu
+from vislam.sim.faults.moment import Event, Moment, Stream, again, changed, ended, glued, gone, held, stepped
 
 _NS = 1_000_000_000
 _BEGIN_S = 5.0  # after the first frame: the run has begun by then, and was right so far
-_GRAVITY_M_S2 = 9.81
-_STEPS = (1.0, 0.4, 1.6, 0.7)  # gains, one after the other
-_STEP_S = 1.5
-_SALT = 0.05  # of the pixels
+_EVER_S = 1e6  # longer than a recording
 _AXIS = np.array([0.3, 0.8, 0.5]) / np.linalg.norm([0.3, 0.8, 0.5])
-_VIBRATION = np.array([0.10, 0.12, 0.08, 3.0, 4.0, 5.0])  # amplitudes, rad/s and m/s^2 ...
-_VIBRATION_HZ = 87.0  # ... of a propeller, beyond half the rate of many units, so that it is aliased
-_ACCEL_RANGE_SHARE, _GYRO_RANGE_RAD_S = 0.05, 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: what it is in words, what a recording needs for it, and what it changes."""
+    """One fault: what it is in words, what a recording needs for it, and what it changes.
+
+    Needs are some of "imu", "images", "stereo", "depth" and "scale" (stereo or depth).
+    """
 
     words: str
-    needs: frozenset[str]  # of "imu", "images", "stereo", "depth"
+    needs: frozenset[str]
     stream: Stream | None = None
     rig: Callable[[Rig], Rig] | None = None
+    lasts_s: tuple[float, float] | None = None  # least and most; None: it is there from the beginning to the end
+    named: tuple[tuple[str, Happening | None], ...] = ()  # events that it is; None: of a kind that there is none for
+    spares: frozenset[str] | None = None  # needs of a recording whose other values suffice; None: they never do
+    steps_s: float = 0.0  # by which frames after it are stamped later
 
     def fits(self, recording: Recording, has_images: bool) -> bool:
         """Whether a recording has what the fault is about."""
-        has = {"imu": recording.imu_noise is not None, "images": has_images}
-        has |= {"stereo": recording.rig.is_stereo, "depth": recording.rig.has_depth}
-        return all(has[need] for need in self.needs)
+        return self.needs <= _has(recording) | ({"images"} if has_images else set())
+
+    def spared(self, recording: Recording) -> bool:
+        """Whether what is left of a recording suffices for the estimate."""
+        return self.spares is not None and self.spares <= _has(recording)
+
+
+def _has(recording: Recording) -> set[str]:
+    rig = recording.rig
+    has = {"imu": recording.imu_noise is not None, "stereo": rig.is_stereo, "depth": rig.has_depth}
+    return {name for name, there in (has | {"scale": rig.is_stereo or rig.has_depth}).items() if there}
+
+
+class _Judged(dict[str, int]):
+    """What a reader counts, and its judges of streams."""
+
+    def __init__(self, known: Mapping[str, int]) -> None:
+        super().__init__(known)
+        self.judges = {name: StreamJudge(name) for name in ("imu0", "cam0")}
 
 
 class FaultyRecording(WrappedRecording):
-    """A recording with a fault (see `vislam.core.recording.Recording`), from its first frame on, or only a piece of it.
+    """A recording with a fault (see `vislam.core.recording.Recording`), or only a piece of it.
 
-    The same arguments give the same values.
+    Stamps that a fault disordered are judged as readers of files do it. The same arguments give the same values.
+
+    Attributes:
+        fault: that is put in.
+        from_s, to_s: when it is there, in seconds since the first frame.
     """
 
-    def __init__(self, recording: Recording, fault: str = "", seed: int = 0, length_s: float | None = None) -> None:
+    def __init__(
+        self, recording: Recording, fault: str = "", seed: int = 0, length_s: float | None = None,
+        from_s: float = _BEGIN_S,
+    ) -> None:  # fmt: skip
         """Wrap a recording.
 
         Args:
             recording: any.
             fault: one of `FAULTS`; empty: none, only the piece is cut.
-            seed: of what is random about the fault.
+            seed: of what is random about the fault, its length too.
             length_s: the recording ends so long after its first frame; None: where it does.
+            from_s: when the fault begins, after the first frame, unless it is there from the beginning.
 
         Raises:
             UsageError: no such fault.
@@ -73,272 +99,77 @@ class FaultyRecording(WrappedRecording):
         if fault and fault not in FAULTS:
             raise UsageError(f"no fault '{fault}'; there are: {', '.join(FAULTS)}")
         super().__init__(recording)
-        self._seed, self._length_s = seed, length_s
-        self._fault = FAULTS[fault] if fault else Fault("nothing", frozenset())
+        self._seed, self._length_s, self._first_ns = seed, length_s, 0
+        self.fault = FAULTS[fault] if fault else Fault("nothing", frozenset())
+        least_s, most_s = self.fault.lasts_s or _ON
+        self.from_s = from_s if self.fault.lasts_s else -_EVER_S
+        self.to_s = self.from_s + np.random.default_rng([seed]).uniform(least_s, most_s)
         self.name = f"{recording.name} {fault}".strip()
-        self.rig = recording.rig if self._fault.rig is None else self._fault.rig(recording.rig)
+        self.rig = recording.rig if self.fault.rig is None else self.fault.rig(recording.rig)
 
     def events(self, from_ns: int | None = None) -> Iterator[Event]:
         """Yield the values with their fault, all of them: what `from_ns` leaves out would change what is random."""
         events: Iterator[Event] = iter(self._recording.events())
+        before = list(_until_frame(events))
+        self._first_ns = before[-1].t_ns if before else 0
+        events = chain(before, events)
         if self._length_s is not None:
-            events = _cut(events, self._length_s)
-        if self._fault.stream is not None:
-            events = self._fault.stream(events, self._recording.rig, np.random.default_rng(self._seed))
-        yield from events
+            events = _cut(events, self._first_ns + round(self._length_s * _NS))
+        if self.fault.stream is None:
+            return events
+        moment = Moment(self._ns(self.from_s), self._ns(self.to_s), np.random.default_rng(self._seed), self.rig)
+        self.problems = judged = _Judged(self._recording.problems)
+        return _as_read(self.fault.stream(events, moment), judged.judges)
+
+    def truth(self) -> Trajectory | None:
+        """Return the truth by the clock of the frames; what they leave out is not in it. After `events`."""
+        truth = super().truth()
+        if truth is None or not self.fault.steps_s:
+            return truth
+        from_ns, t_ns = self._ns(self.from_s), truth.t_ns + round(self.fault.steps_s * _NS)
+        late = (truth.t_ns >= from_ns) & (t_ns >= from_ns)
+        early = truth.t_ns < from_ns
+        poses = truth.T_world_body
+        return Trajectory(np.concatenate([truth.t_ns[early], t_ns[late]]), np.concatenate([poses[early], poses[late]]))
+
+    def _ns(self, since_s: float) -> int:
+        return self._first_ns + round(since_s * _NS)
 
 
-def _cut(events: Iterable[Event], length_s: float) -> Iterator[Event]:
-    end_ns: int | None = None
+def _until_frame(events: Iterator[Event]) -> Iterator[Event]:
     for value in events:
-        if end_ns is None and isinstance(value, Frame):
-            end_ns = value.t_ns + round(length_s * _NS)
-        if end_ns is not None and value.t_ns > end_ns:
+        yield value
+        if isinstance(value, Frame):
+            return
+
+
+def _cut(events: Iterable[Event], end_ns: int) -> Iterator[Event]:
+    for value in events:
+        if value.t_ns > end_ns:
             return
         yield value
 
 
-# -- images ------------------------------------------------------------------------------------------------------------
-
-
-def _frames(change: Callable[[Frame, float], Frame], events: Iterator[Event]) -> Iterator[Event]:
-    """Yield events with every frame changed, by the time since the first one."""
-    first_ns: int | None = None
-    for value in events:
-        if isinstance(value, Frame):
-            first_ns = value.t_ns if first_ns is None else first_ns
-            yield change(value, (value.t_ns - first_ns) / _NS)
-        else:
-            yield value
-
-
-def _images(
-    change: Callable[[ImageU8, float, int, np.random.Generator], ImageU8],
-) -> Stream:
-    """Return the fault that changes every image [H, W] of a frame, by the time since the first one and its camera."""
-
-    def stream(events: Iterator[Event], _: Rig, rng: np.random.Generator) -> Iterator[Event]:
-        def changed(frame: Frame, since_s: float) -> Frame:
-            return replace(frame, images=tuple(change(im, since_s, k, rng) for k, im in enumerate(frame.images)))
-
-        return _frames(changed, events)
-
-    return stream
-
-
-def _black(image: ImageU8, since_s: float, camera: int, _: np.random.Generator) -> ImageU8:
-    return np.zeros_like(image) if in_window(since_s, _BEGIN_S, 5.0) else image
-
-
-def _one_black(image: ImageU8, since_s: float, camera: int, rng: np.random.Generator) -> ImageU8:
-    return image if camera == 0 else _black(image, since_s, camera, rng)
-
-
-def _gain(image: ImageU8, since_s: float, camera: int, _: np.random.Generator) -> ImageU8:
-    return np.clip(image * _STEPS[int(since_s / _STEP_S) % len(_STEPS)], 0.0, 255.0).astype(np.uint8)
-
-
-def _blur(image: ImageU8, since_s: float, camera: int, _: np.random.Generator) -> ImageU8:
-    if not in_window(since_s, _BEGIN_S, 3.0):
-        return image
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 3.0), dtype=np.uint8)
-
-
-def _salt(image: ImageU8, since_s: float, camera: int, rng: np.random.Generator) -> ImageU8:
-    drawn = rng.random(image.shape, dtype=np.float32)
-    return np.where(drawn < 0.5 * _SALT, 0, np.where(drawn > 1.0 - 0.5 * _SALT, 255, image)).astype(np.uint8)
-
-
-def _frozen(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterator[Event]:
-    """Repeat one frame for 3 s, with stamps that go on, as a stuck driver does."""
-    stuck: list[Frame] = []
-
-    def changed(frame: Frame, since_s: float) -> Frame:
-        if not in_window(since_s, _BEGIN_S, 3.0):
-            return frame
-        stuck.append(frame)
-        return replace(stuck[0], t_ns=frame.t_ns, index=frame.index)
-
-    return _frames(changed, events)
-
-
-def _person(events: Iterator[Event], rig: Rig, rng: np.random.Generator) -> Iterator[Event]:
-    """Put a person over a half of the image who walks to and fro 2 m away, dressed in a pattern."""
-    size = (rig.cameras[0].height, rig.cameras[0].width)
-    cloth = sum(cv2.resize(rng.random((size[0] // n, size[1] // n)), size[::-1]) for n in (4, 12, 36))
-    cloth_u8 = (cloth * (255.0 / 3.0)).astype(np.uint8)
-    shift_px = rig.cameras[0].fx * float(np.linalg.norm(rig.T_cam0_cam1[:3, 3])) / PERSON_M if rig.is_stereo else 0.0
-
-    def changed(frame: Frame, since_s: float) -> Frame:
-        if since_s < _BEGIN_S:
-            return frame
-        box = person_box(rig.cameras[0], 0.5, since_s)
-        images = tuple(_dressed(im, cloth_u8, box, k * shift_px) for k, im in enumerate(frame.images))
-        depth = None if frame.depth_m is None else frame.depth_m.copy()
-        if depth is not None:
-            left, right = np.clip((box[0, 0] + np.array([-1, 1]) * box[1, 0]).astype(int), 0, size[1])
-            depth[:, left:right] = PERSON_M
-        return replace(frame, images=images, depth_m=depth)
-
-    return _frames(changed, events)
-
-
-def _dressed(image: ImageU8, cloth: ImageU8, box: Array, shift_px: float) -> ImageU8:
-    middle, half = box[0, 0] - shift_px, box[1, 0]
-    left, right = np.clip([round(middle - half), round(middle + half)], 0, image.shape[1])
-    begin = max(round(half - middle), 0)  # of the cloth, where the person stands half outside
-    out = image.copy()
-    out[:, left:right] = cloth[: image.shape[0], begin : begin + right - left]
-    return out
-
-
-def _rolling(events: Iterator[Event], rig: Rig, _: np.random.Generator, readout_s: float) -> Iterator[Event]:
-    """Shift rows as the turn of the body during the readout does; the stamp is the middle row's."""
-    rate: Array = np.zeros(3)
-    for value in events:
-        if isinstance(value, ImuSample):
-            rate = value.gyro_rad_s
-        if not isinstance(value, Frame):
-            yield value
-            continue
-        rates = [T[:3, :3].T @ rate for T in rig.T_body_cams]
-        seen = zip(value.images, rig.cameras, rates, strict=False)
-        yield replace(value, images=tuple(_sheared(im, camera, w, readout_s) for im, camera, w in seen))
-
-
-def _sheared(image: ImageU8, camera: Camera, rate_cam_rad_s: Array, readout_s: float) -> ImageU8:
-    height, width = image.shape
-    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
-    late_s = readout_s * ((v + 0.5) / height - 0.5)
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    wx, wy, wz = (float(w) for w in rate_cam_rad_s)
-    du = camera.fx * late_s * (-wx * x * y + wy * (1.0 + x * x) - wz * y)  # a ray of the middle row's camera turns
-    dv = camera.fy * late_s * (-wx * (1.0 + y * y) + wy * x * y + wz * x)  # by the opposite of the body's turn
-    return np.asarray(cv2.remap(image, u + du.astype(np.float32), v + dv.astype(np.float32), cv2.INTER_LINEAR))
-
-
-def _depth_scaled(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterator[Event]:
-    def changed(frame: Frame, _: float) -> Frame:
-        return frame if frame.depth_m is None else replace(frame, depth_m=frame.depth_m * np.float32(1.05))
-
-    return _frames(changed, events)
-
-
-# -- frames as a whole -------------------------------------------------------------------------------------------------
-
-
-def _dropped(events: Iterator[Event], _: Rig, rng: np.random.Generator) -> Iterator[Event]:
-    for value in events:
-        if not isinstance(value, Frame) or rng.random() >= 0.2:
-            yield value
-
-
-def _late(events: Iterator[Event], _: Rig, __: np.random.Generator, late_s: float) -> Iterator[Event]:
-    """Stamp frames late; they come in the order of their stamps."""
-    waiting: list[tuple[int, int, Frame]] = []
-    for value in events:
-        if isinstance(value, Frame):
-            t_ns = value.t_ns + round(late_s * _NS)
-            heapq.heappush(waiting, (t_ns, value.index, replace(value, t_ns=t_ns)))
-            continue
-        while waiting and waiting[0][0] <= value.t_ns:
-            yield heapq.heappop(waiting)[2]
-        yield value
-    while waiting:
-        yield heapq.heappop(waiting)[2]
-
-
-def _swapped(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterator[Event]:
-    def changed(frame: Frame, _: float) -> Frame:
-        tracks = frame.tracks
-        if tracks is not None and tracks.right_px is not None:
-            tracks = replace(tracks, pixels_px=tracks.right_px, right_px=tracks.pixels_px)
-        return replace(frame, images=frame.images[::-1], tracks=tracks)
-
-    return _frames(changed, events)
-
-
-# -- inertial data -----------------------------------------------------------------------------------------------------
-
-
-def _inertial(change: Callable[[Array, float, np.random.Generator], Array | None]) -> Stream:
-    """Return the fault that changes every sample [6] (gyro, accel), by the time since the first frame; None: gone."""
-
-    def stream(events: Iterator[Event], _: Rig, rng: np.random.Generator) -> Iterator[Event]:
-        first_ns: int | None = None
-        for value in events:
-            if isinstance(value, Frame) and first_ns is None:
-                first_ns = value.t_ns
-            if not isinstance(value, ImuSample):
-                yield value
-                continue
-            since_s = -1.0 if first_ns is None else (value.t_ns - first_ns) / _NS
-            changed = change(np.concatenate([value.gyro_rad_s, value.accel_m_s2]), since_s, rng)
-            if changed is not None:
-                yield ImuSample(value.t_ns, changed[:3], changed[3:])
-
-    return stream
-
-
-def _noisy(events: Iterator[Event], _: Rig, rng: np.random.Generator) -> Iterator[Event]:
-    """Add what makes the white noise eight times that of a unit of the EuRoC drone's class (an ADIS16448)."""
-    sigmas = 8.0 * np.sqrt(200.0) * np.repeat([1.7e-4, 2.0e-3], 3)
-    yield from _inertial(lambda six, _, r: six + sigmas * r.standard_normal(6))(events, _, rng)
-
-
-def _thinned(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterator[Event]:
-    """Keep one sample in four, unfiltered, as a bus that is too slow does."""
-    count = 0
-    for value in events:
-        count += isinstance(value, ImuSample)
-        if not isinstance(value, ImuSample) or count % 4 == 0:
-            yield value
-
-
-def _shaken(six: Array, since_s: float, _: np.random.Generator) -> Array:
-    phase = 2.0 * np.pi * _VIBRATION_HZ * since_s + np.arange(6)
-    return six + _VIBRATION * np.sin(phase)
-
-
-def _in_g(six: Array, _: float, __: np.random.Generator) -> Array:
-    return np.concatenate([six[:3], six[3:] / _GRAVITY_M_S2])
-
-
-def _flipped(six: Array, _: float, __: np.random.Generator) -> Array:
-    return six * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
-
-
-def _gyro_flipped(six: Array, _: float, __: np.random.Generator) -> Array:
-    return six * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
-
-
-def _clipped(six: Array, _: float, __: np.random.Generator) -> Array:
-    return np.concatenate([np.clip(six[:3], -_GYRO_RANGE_RAD_S, _GYRO_RANGE_RAD_S), six[3:]])
-
-
-def _stretched(six: Array, _: float, __: np.random.Generator) -> Array:
-    return np.concatenate([six[:3], (1.0 + _ACCEL_RANGE_SHARE) * six[3:]])
-
-
-def _missing(six: Array, since_s: float, _: np.random.Generator) -> Array | None:
-    return None if in_window(since_s, _BEGIN_S, 1.5) else six
-
-
-def _stuck(events: Iterator[Event], _: Rig, __: np.random.Generator) -> Iterator[Event]:
-    """Repeat one sample from `_BEGIN_S` on, with stamps that go on."""
-    first_ns: int | None = None
-    kept: ImuSample | None = None
-    for value in events:
-        if isinstance(value, Frame) and first_ns is None:
-            first_ns = value.t_ns
-        if isinstance(value, ImuSample) and first_ns is not None and value.t_ns - first_ns > _BEGIN_S * _NS:
-            kept = value if kept is None else kept
-            yield replace(kept, t_ns=value.t_ns)
-        else:
-            yield value
-
-
-# -- what is stated of the cameras -------------------------------------------------------------------------------------
+def _as_read(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iterator[Event]:
+    """Yield values in the order of their stamps, without those that do not advance; tear frames where a clock stepped.
+
+    As `vislam.datasets` does it, which this room does not know.
+    """
+    one, other = tee(events)
+    samples = (
+        v for v in one if not isinstance(v, Frame) and (isinstance(v, MagSample) or judges["imu0"].takes(v.t_ns))
+    )
+    return heapq.merge(samples, _torn(other, judges), key=lambda value: value.t_ns)
+
+
+def _torn(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iterator[Event]:
+    last_ns: int | None = None
+    for frame in events:
+        if isinstance(frame, Frame) and judges["cam0"].takes(frame.t_ns):
+            steps = (e.from_ns for j in judges.values() for e in j.events if e.happening is Happening.STEP_BACK)
+            is_torn = last_ns is not None and any(last_ns <= step_ns < frame.t_ns for step_ns in steps)
+            yield replace(frame, follows_step=True) if is_torn else frame
+            last_ns = frame.t_ns
 
 
 def _turned(rig: Rig, deg: float) -> Rig:
@@ -357,30 +188,99 @@ def _needs(*names: str) -> frozenset[str]:
     return frozenset(names)
 
 
-FAULTS: Mapping[str, Fault] = {
-    "black": Fault("black images for 5 s", _needs("images"), _images(_black)),
-    "one black": Fault("one camera of two is black for 5 s", _needs("images", "stereo"), _images(_one_black)),
-    "gain": Fault("exposure jumps every 1.5 s", _needs("images"), _images(_gain)),
-    "blur": Fault("3 s out of focus", _needs("images"), _images(_blur)),
-    "salt": Fault("5 % of the pixels are salt and pepper", _needs("images"), _images(_salt)),
-    "frozen": Fault("the same image again and again for 3 s", _needs("images"), _frozen),
-    "person": Fault("a person over half of the image, from 5 s on", _needs("images"), _person),
+_ANY, _IMU, _IMAGES, _PAIR = _needs(), _needs("imu"), _needs("images"), _needs("images", "stereo")
+_SCALE, _RGBD = _needs("scale"), _needs("images", "depth")
+_ON, _LONG = (2 * _EVER_S, 2 * _EVER_S), (1.0, 3.0)
+
+
+def _break(
+    words: str, needs: frozenset[str], stream: Stream, lasts_s: tuple[float, float] = _ON, named: str = "",
+    spares: frozenset[str] | None = None, steps_s: float = 0.0,
+) -> Fault:  # fmt: skip
+    """Return a fault that begins at some moment; `named` is "stream: happening, ..." of the events that it is."""
+    events = (event.split(": ") for event in named.split(", ") if event)
+    pairs = tuple((s, None if h == "?" else Happening(h)) for s, h in events)
+    return Fault(words, needs, stream, None, lasts_s, pairs, spares, steps_s)
+
+
+_BOTH_BACK, _BOTH_HOLE = "imu0: step back, cam0: step back", "imu0: hole, cam0: hole"
+
+# what is there from the beginning to the end: calibration, units, mounting
+_THROUGHOUT: Mapping[str, Fault] = {
     "rolling": Fault("a rolling shutter of 30 ms that is not stated", _needs("images", "imu"), partial(
-        _rolling, readout_s=0.03)),
-    "depth": Fault("depth 5 % too long", _needs("depth", "images"), _depth_scaled),
-    "dropped": Fault("a fifth of the frames never arrives", _needs(), _dropped),
-    "late": Fault("the camera's clock is 20 ms late", _needs("imu"), partial(_late, late_s=0.02)),
-    "swapped": Fault("the cables of a stereo pair are swapped", _needs("stereo"), _swapped),
-    "turned": Fault("the camera is stated 3 degrees wrong on the body", _needs("imu"), None, partial(_turned, deg=3.0)),
-    "focal": Fault("focal length 2 % too long", _needs(), None, partial(_focal, factor=1.02)),
-    "noise": Fault("white noise eight times that of the model", _needs("imu"), _noisy),
-    "slow": Fault("a quarter of the inertial samples arrives", _needs("imu"), _thinned),
-    "vibration": Fault("the vibration of a propeller, aliased", _needs("imu"), _inertial(_shaken)),
-    "in g": Fault("the accelerometer is in g, not m/s^2", _needs("imu"), _inertial(_in_g)),
-    "flipped": Fault("the y axis of the unit has the wrong sign", _needs("imu"), _inertial(_flipped)),
-    "gyro flipped": Fault("the gyro's z axis has the wrong sign", _needs("imu"), _inertial(_gyro_flipped)),
-    "clipped": Fault("the gyro saturates at 0.5 rad/s", _needs("imu"), _inertial(_clipped)),
-    "stretched": Fault("the accelerometer reads 5 % too much", _needs("imu"), _inertial(_stretched)),
-    "stuck": Fault("one inertial sample again and again", _needs("imu"), _stuck),
-    "missing": Fault("no inertial sample for 1.5 s", _needs("imu"), _inertial(_missing)),
+        cam.rolling, readout_s=0.03)),
+    "depth": Fault("depth 5 % too long", _RGBD, cam.LONG_DEPTH),
+    "dropped": Fault("a fifth of the frames never arrives", _ANY, cam.some_dropped(0.2)),
+    "late": Fault("the camera's clock is 20 ms late", _IMU, stepped(0.02, Frame)),
+    "swapped": Fault("the cables of a stereo pair are swapped", _needs("stereo"), changed(Frame, cam.swapped)),
+    "turned": Fault("the camera is stated 3 degrees wrong on the body", _IMU, None, partial(_turned, deg=3.0)),
+    "focal": Fault("focal length 2 % too long", _ANY, None, partial(_focal, factor=1.02)),
+    "slow": Fault("a quarter of the inertial samples arrives", _IMU, imu.every(4)),
+    "in g": Fault("the accelerometer is in g, not m/s^2", _IMU, imu.IN_G),
+    "flipped": Fault("the y axis of the unit has the wrong sign", _IMU, imu.scaled(1, -1, 1, 1, -1, 1)),
+    "gyro flipped": Fault("the gyro's z axis has the wrong sign", _IMU, imu.scaled(1, 1, -1, 1, 1, 1)),
+    "stretched": Fault("the accelerometer reads 5 % too much", _IMU, imu.STRETCHED),
+    "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY),
+    "vibration": Fault("the vibration of a propeller, aliased", _IMU, imu.SHAKEN),
+    "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED),
+    "salt": Fault("5 % of the pixels are salt and pepper", _IMAGES, cam.SALTED),
+    "gain": Fault("exposure jumps every 1.5 s", _IMAGES, cam.GAIN),
 }  # fmt: skip
+
+# what begins at some moment
+BREAKS: Mapping[str, Fault] = {
+    "person": _break("a person over half of the image", _IMAGES, cam.person),
+    **{f"imu hole {s}": _break(f"no inertial sample for {s} s", _IMU, gone(ImuSample), (s, s), "imu0: hole", _ANY)
+       for s in (0.3, 1.0, 3.0)},
+    "camera hole 0.3": _break("no frame for 0.3 s", _ANY, gone(Frame), (0.3, 0.3), "cam0: hole", _IMU),
+    **{f"camera hole {s}": _break(f"no frame for {s} s", _ANY, gone(Frame), (s, s), "cam0: hole") for s in (1.0, 3.0)},
+    "hole": _break("nothing arrives", _IMU, gone(object), _LONG, _BOTH_HOLE),
+    "all back 5": _break("all clocks step back by 5 s", _IMU, stepped(-5.0, object), _ON, _BOTH_BACK, None, -5.0),
+    "all back 1": _break("all clocks step back by 1 s", _IMU, stepped(-1.0, object), _ON, _BOTH_BACK, None, -1.0),
+    "all forth": _break("all clocks step forth by 5 s", _IMU, stepped(5.0, object), _ON, _BOTH_HOLE, None, 5.0),
+    "camera back": _break("the camera's clock steps back by 1 s", _ANY, stepped(-1.0, Frame), _ON,
+        "cam0: step back", None, -1.0),
+    "camera forth": _break("the camera's clock steps forth by 1 s", _ANY, stepped(1.0, Frame), _ON, "cam0: hole",
+        None, 1.0),
+    "imu back": _break("the IMU's clock steps back by 1 s", _IMU, stepped(-1.0, ImuSample), _ON,
+        "imu0: step back", _SCALE),
+    "imu forth": _break("the IMU's clock steps forth by 1 s", _IMU, stepped(1.0, ImuSample), _ON, "imu0: hole", _SCALE),
+    "again": _break("the log is played twice", _ANY, again, _ON, "cam0: step back"),
+    "glued": _break("two logs as one, stamps go on as if nothing were", _ANY, glued, (2.0, 2.0), "cam0: ?", None, -2.0),
+    "ended": _break("the end is missing", _ANY, ended, _ON, "", _ANY),
+    "stuck": _break("one inertial sample again and again", _IMU, held(
+        ImuSample, lambda first, row: replace(first, t_ns=row.t_ns)), _ON, "imu0: stuck", _SCALE),
+    "axis stuck": _break("the gyro's z axis repeats one value", _IMU, held(ImuSample, lambda first, row: replace(
+        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, "imu0: ?", _SCALE),
+    "twice": _break("half of the inertial rows come twice", _IMU, imu.twice, _LONG, "imu0: duplicate", _ANY),
+    "repeated": _break("every other sample is the one before", _IMU, imu.every(2, is_kept=True), _LONG, "", _SCALE),
+    "disordered": _break("one inertial row in fifty is late", _IMU, imu.disordered, _ON, "imu0: late", _ANY),
+    "no number": _break("inertial rows are NaN", _IMU, imu.NO_NUMBER, _LONG, "imu0: unusable", _ANY),
+    "bursts": _break("inertial rows come in bursts, stamped then", _IMU, imu.in_bursts, _ON, "imu0: ?", _SCALE),
+    "coarse": _break("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, "imu0: duplicate", _SCALE),
+    "halved": _break("every other inertial sample is missing", _IMU, imu.every(2), _ON, "imu0: ?", _ANY),
+    "clips": _break("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, "imu0: ?", _SCALE),
+    "shaken": _break("the vibration of a propeller, aliased", _IMU, imu.SHAKEN, _ON),
+    "spikes": _break("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, "imu0: ?", _SCALE),
+    "reconnected": _break("the IMU comes back with two axes turned", _IMU, imu.scaled(-1, -1, 1, -1, -1, 1), _ON,
+        "imu0: ?", _SCALE),
+    "now in g": _break("the IMU comes back with another unit", _IMU, imu.IN_G, _ON, "imu0: ?", _SCALE),
+    "black": _break("black images", _IMAGES, cam.BLACK, _LONG, "cam0: dark"),
+    "white": _break("white images", _IMAGES, cam.WHITE, _LONG, "cam0: ?"),
+    "covered": _break("a hand on the lens", _IMAGES, cam.COVERED, _LONG, "cam0: ?"),
+    "frozen": _break("the same image again and again", _IMAGES, held(Frame, cam.as_before), _LONG, "cam0: repeated"),
+    "now and then": _break("one image in ten repeats the one before", _IMAGES, cam.now_and_then, _ON, "", _ANY),
+    "blur": _break("out of focus", _IMAGES, cam.BLURRED, _LONG, "cam0: ?"),
+    "dimmed": _break("exposure falls to 40 %", _IMAGES, cam.DIMMED, _ON, "", _ANY),
+    "half dropped": _break("half of the frames never arrives", _ANY, cam.some_dropped(0.5), _LONG, "", _IMU),
+    "one black": _break("one camera of two is black", _PAIR, cam.ONE_BLACK, _LONG, "cam1: dark", _IMU),
+    "one frozen": _break("one camera of two repeats one image", _PAIR, held(Frame, lambda first, frame: replace(
+        frame, images=(frame.images[0], *first.images[1:]))), _LONG, "cam1: repeated", _IMU),
+    "one gone": _break("one camera of two sends nothing", _PAIR, cam.ONE_GONE, _LONG, "cam1: hole", _IMU),
+    "crossed": _break("left and right are exchanged", _needs("stereo"), changed(Frame, cam.swapped), _ON, "cam0: ?"),
+    "no depth": _break("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, "depth0: ?"),
+    "frozen depth": _break("the same depth image again and again", _RGBD, held(
+        Frame, lambda first, frame: replace(frame, depth_m=first.depth_m)), _LONG, "depth0: repeated"),
+}  # fmt: skip
+
+FAULTS: Mapping[str, Fault] = {**_THROUGHOUT, **BREAKS}
