@@ -55,6 +55,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),
         ({"frames_missing": 100}, "100 of 500 frames never arrived"),
         ({"frames_repeated": 40}, "40 images repeat the one before"),
+        ({"dark_s": 2.5}, "images were dark for 2.5 s"),
         ({"submaps_apart": 2}, "2 submaps"),
         ({"is_started": False, "start_reason": "gravity norm 1.00"}, "gravity was not found"),
         ({"start_failures": 5}, "contradicted each other in 5 attempts"),
@@ -120,6 +121,12 @@ def test_what_calibration_corrected_is_told_without_a_doubt():
     assert found.state is Trust.TRUSTED
     assert any("20.0 ± 0.5 ms late" in words and "corrected" in words for words in found.moved)
     assert any("turned by 1.20 ± 0.10 degrees" in words for words in found.moved)
+
+
+def test_a_start_that_was_taken_back_is_told_without_a_doubt():
+    found = verdict(starts_taken_back=1)
+    assert found.state is Trust.TRUSTED
+    assert "taken back" in found.moved[0] and "stepped" in found.moved[0]
 
 
 def test_what_is_found_far_off_but_badly_known_is_no_doubt():

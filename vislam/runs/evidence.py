@@ -44,7 +44,8 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         frames_degraded=front.get("frames_degraded", 0),
         frames_by_depth=front.get("frames_by_depth", 0),
         frames_missing=feed.get("missing", 0),
-        frames_repeated=feed.get("repeated", 0),
+        frames_repeated=feed.get("repeated", 0) - _equal_in_the_dark(report.events),
+        dark_s=max((_lasted_s(e) for e in report.events if e.happening is Happening.DARK), default=0.0),
         frames_offered=live.get("frames_offered", 0),
         frames_dropped=live.get("frames_dropped", 0),
         frames_left_out=live.get("frames_left_out", 0),
@@ -58,6 +59,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         is_started=not has_imu or report.start is not None,
         start_reason=report.refusal,
         start_failures=sum(refusals.get(name, 0) for name in _REFUSALS),
+        starts_taken_back=counters.get("initialisation", {}).get("taken_back", 0),
         is_confirmed=report.is_confirmed,
         innovations=report.nis,
         keyframes=ekf.get("keyframes", 0),
@@ -90,9 +92,19 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
 
 def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
-    lasted_s = (event.to_ns - event.from_ns) * 1e-9
-    is_gone = event.happening in (Happening.STUCK, Happening.UNUSABLE) and lasted_s > max_gap_s
+    is_gone = event.happening in (Happening.STUCK, Happening.UNUSABLE) and _lasted_s(event) > max_gap_s
     return is_gone or event.tears
+
+
+def _lasted_s(event: StreamEvent) -> float:
+    return (event.to_ns - event.from_ns) * 1e-9
+
+
+def _equal_in_the_dark(events: Sequence[StreamEvent]) -> int:
+    """Return how many images equal the one before because both are dark: no driver is stuck."""
+    dark = [event for event in events if event.happening is Happening.DARK]
+    equal = (event for event in events if event.happening is Happening.REPEATED)
+    return sum(e.rows for e in equal if any(d.from_ns <= e.from_ns and e.to_ns <= d.to_ns for d in dark))
 
 
 def _together(events: Sequence[StreamEvent], begin_ns: int) -> Iterator[str]:

@@ -53,7 +53,8 @@ class Evidence:
     frames_degraded: int = 0
     frames_by_depth: int = 0  # of those: placed by depth alone
     frames_missing: int = 0  # that an even rate would have brought
-    frames_repeated: int = 0  # equal to the one before in motion
+    frames_repeated: int = 0  # equal to the one before in motion, though not dark
+    dark_s: float = 0.0  # longest time in which images showed nothing
     coverage: float = 1.0  # share of the frames that have a pose
     submaps_apart: int = 0  # submaps that no loop has joined with the first
     # how a live run kept up
@@ -73,6 +74,7 @@ class Evidence:
     is_started: bool = True  # gravity was found, or there is no IMU
     start_reason: str = ""  # how it was found, or why not
     start_failures: int = 0  # attempts in which sensors contradicted each other
+    starts_taken_back: int = 0  # that poses were published of already
     is_confirmed: bool = True  # the start, by what came after it
     scale_sigma: float = 0.0  # relative, of one camera's metres at the end; 0: they are known, or there are none
     # the filter

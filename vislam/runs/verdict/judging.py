@@ -122,6 +122,8 @@ def _lost(e: Evidence, _: VerdictConfig) -> Iterator[str]:
 def _streams(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     """Name what happened to sensors: much of what else is wrong comes of that."""
     yield from (f"{event}: look at the sensor's cable, driver and clock" for event in e.events)
+    if e.dark_s > _LOST_S:
+        yield f"images were dark for {e.dark_s:.1f} s: look at the lens, the light and the exposure"
 
 
 def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
@@ -269,6 +271,11 @@ _TESTS: tuple[Callable[[Evidence, VerdictConfig], Iterator[str]], ...] = (
 
 def _moved(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     """Report what was estimated significantly off, though no farther than its kind usually is: it was corrected."""
+    if e.starts_taken_back:
+        yield (
+            f"{e.starts_taken_back} provisional starts did not survive the seconds after them and were taken back: "
+            "poses published before then have another scale and vertical, and stepped"
+        )
     if e.clock is not None and _beyond(e.clock, 0.0, 1, c) and not _beyond(e.clock, _CLOCK_SIGMA_S, 1, c):
         yield f"{_clock_words(e.clock)}; corrected, --init.time-offset-s {e.clock.by:.4f} sets it from the start"
     turn = e.rotation

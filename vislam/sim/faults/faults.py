@@ -7,17 +7,18 @@ A fault changes the stream of values, or what is stated of the cameras; the trut
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, tee
+from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
-from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.messages import Frame, ImuSample
 from vislam.core.recording import Recording, WrappedRecording
 from vislam.core.streams import Happening, StreamJudge
 from vislam.core.trajectory import Trajectory
@@ -155,21 +156,20 @@ def _as_read(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iter
 
     As `vislam.datasets` does it, which this room does not know.
     """
-    one, other = tee(events)
-    samples = (
-        v for v in one if not isinstance(v, Frame) and (isinstance(v, MagSample) or judges["imu0"].takes(v.t_ns))
-    )
-    return heapq.merge(samples, _torn(other, judges), key=lambda value: value.t_ns)
-
-
-def _torn(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iterator[Event]:
+    waiting: dict[str, deque[Event]] = {}
     last_ns: int | None = None
-    for frame in events:
-        if isinstance(frame, Frame) and judges["cam0"].takes(frame.t_ns):
+    for value in events:
+        stream = "cam0" if isinstance(value, Frame) else "imu0" if isinstance(value, ImuSample) else "mag0"
+        if stream in judges and not judges[stream].takes(value.t_ns):
+            continue
+        if isinstance(value, Frame):
             steps = (e.from_ns for j in judges.values() for e in j.events if e.happening is Happening.STEP_BACK)
-            is_torn = last_ns is not None and any(last_ns <= step_ns < frame.t_ns for step_ns in steps)
-            yield replace(frame, follows_step=True) if is_torn else frame
-            last_ns = frame.t_ns
+            is_torn = last_ns is not None and any(last_ns <= step_ns < value.t_ns for step_ns in steps)
+            last_ns, value = value.t_ns, replace(value, follows_step=is_torn)  # noqa: PLW2901
+        waiting.setdefault(stream, deque()).append(value)
+        while all(waiting.values()):
+            yield min(waiting.values(), key=lambda some: some[0].t_ns).popleft()
+    yield from heapq.merge(*waiting.values(), key=lambda value: value.t_ns)
 
 
 def _turned(rig: Rig, deg: float) -> Rig:
