@@ -164,9 +164,9 @@ def judged_again(entry: dict[str, Any]) -> dict[str, Any]:
 def is_named(entry: dict[str, Any]) -> bool:
     """Whether each event that a fault is stands among those of a run, at its time."""
     within_s = max(_NAMED_S, entry["interval_s"])
-    there = [(e["stream"], e["happening"]) for e in entry["events"] if abs(e["from_s"] - entry["from_s"]) <= within_s]
-    wanted = FAULTS[entry["fault"]].named if entry["fault"] in FAULTS else ()
-    return all(any(stream == s and happening in (None, h) for s, h in there) for stream, happening in wanted)
+    there = [event for event in entry["events"] if abs(event["from_s"] - entry["from_s"]) <= within_s]
+    kinds = {f"{event['stream']} {kind}" for event in there for kind in (event["happening"], "?")}
+    return entry["fault"] not in FAULTS or kinds.issuperset(FAULTS[entry["fault"]].named)
 
 
 class Judged:

@@ -26,6 +26,11 @@ def run(out, fault="", uri=_URI):
     return execute(FaultyRecording(open_source(uri), fault), config, out, uri, [])
 
 
+def evidence_of(counters=None, events=()):
+    report = FrontReport("rgbd", None, None, "", counters or {}, {}, [], {}, 0.0, {}, events=events)
+    return front_evidence(report, Config().machine)
+
+
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
     out = tmp_path_factory.mktemp("verdict") / "run"
@@ -53,7 +58,7 @@ def test_the_verdict_is_the_first_line_printed_and_the_first_sentence_of_the_rep
     [
         ("turned", "the camera is turned by"),
         ("slow", "inertial samples come at"),
-        ("imu hole 1.0", "no inertial sample for 1.0"),
+        ("imu hole 1.0", "imu0: rows are missing from 5.00 to 6.00 s"),
         ("in g", "gravity was not found"),
         ("dropped", "frames never arrived"),
     ],
@@ -96,12 +101,19 @@ def test_a_faulty_stream_is_the_same_again_and_in_order():
         assert [t_ns for _, t_ns in values] == sorted(t_ns for _, t_ns in values), fault
 
 
+def test_a_hole_is_a_doubt_where_it_is_as_long_as_what_the_other_sensors_cannot_bridge():
+    def reasons(stream, lasts_s):
+        hole = StreamEvent(stream, Happening.HOLE, 2_000_000_000, 2_000_000_000 + round(lasts_s * 1e9), 3)
+        return evidence_of(events=(hole,)).events
+
+    assert reasons("cam0", 0.9) == reasons("imu0", 0.09) == ()
+    assert "cam0: rows are missing from 2.00 to 3.10 s" in reasons("cam0", 1.1)[0]
+    assert "imu0: rows are missing from 2.00 to 2.20 s" in reasons("imu0", 0.2)[0]
+
+
 def test_dark_images_are_not_those_of_a_stuck_driver():
     def evidence(*events):
-        report = FrontReport(
-            "rgbd", None, None, "", {"camera feed": {"frames": 100, "repeated": 14}}, {}, [], {}, 0.0, {}, events=events
-        )
-        return front_evidence(report, Config().machine)
+        return evidence_of({"camera feed": {"frames": 100, "repeated": 14}}, events)
 
     dark = StreamEvent("cam0", Happening.DARK, 6_000_000_000, 8_000_000_000, 11)
     equal = StreamEvent("cam0", Happening.REPEATED, 6_200_000_000, 8_000_000_000, 10)

@@ -45,6 +45,7 @@ CART = "sim:cart-drive,image_width_px=320,camera_hz=10,exposure_s=0,duration_s=3
 # What takes minutes whatever its input has --help: it is imported, and understands its options.
 SMALLEST = {
     "experiments/aliasing.py": "--worlds panels-2.0 --losses 1 --length-m 9",
+    "experiments/breaks.py": "--help",
     "experiments/cart_wheels.py": "--seeds 0 --duration-s 12 --blind-at-s 4 --radii 'as told'",
     "experiments/cloud_smoothing.py": "--seconds 1",
     "experiments/depth_alone.py": "--source {recording} --dark 0.5 --begin 1 --length 2.5",
@@ -66,7 +67,6 @@ SMALLEST = {
     "experiments/spoilt_rgbd.py": "{recording} --cases 0",
     "experiments/starts.py": "--plan {plan} --count 1",
     "experiments/up_without_imu.py": "--recording {recording}",
-    "experiments/verdict.py": "--help",
     "benchmarks/bag_reader.py": "--frames 5 --size 64 48 --rounds 1",
     "benchmarks/drawn_camera.py": "--width 64 --frames 1 --rounds 1 --moments 2",
     "benchmarks/ekf.py": "cost --rounds 1",

@@ -18,7 +18,7 @@ from vislam.core.streams import Happening, StreamEvent
 from vislam.imu import Preintegrated, preintegrate
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
-from vislam.runs.verdict import Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
+from vislam.runs.verdict import LOST_S, Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
 from vislam.trajectory import Trajectory, align, associate
 
 _MIN_COMPARED = 10  # poses
@@ -84,7 +84,6 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         accel_noise=None if noise is None else noise.accel_quiet * given.accelerometer_noise_density,
         rate_hz=condition.rate_hz if np.isfinite(condition.rate_hz) else None,
         rate_told_hz=given.rate_hz,
-        longest_gap_s=condition.longest_gap_s,
         saturated=condition.saturated_axes,
         force_m_s2=condition.force_m_s2 if np.isfinite(condition.force_m_s2) else None,
     )
@@ -92,8 +91,9 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
 
 def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
-    is_gone = event.happening in (Happening.STUCK, Happening.UNUSABLE) and _lasted_s(event) > max_gap_s
-    return is_gone or event.tears
+    if event.happening in (Happening.STUCK, Happening.UNUSABLE, Happening.HOLE):
+        return _lasted_s(event) > (LOST_S if event.stream.startswith("cam") else max_gap_s)
+    return event.tears
 
 
 def _lasted_s(event: StreamEvent) -> float:

@@ -2,9 +2,10 @@
 
 from vislam.runs.verdict.agreement import ForceAgreement, TurnAgreement, TurnStep, force_agreement, turn_agreement
 from vislam.runs.verdict.evidence import Apart, Evidence, Innovations, Moved
-from vislam.runs.verdict.judging import Trust, Verdict, judge, verdict_sentence
+from vislam.runs.verdict.judging import LOST_S, Trust, Verdict, judge, verdict_sentence
 
 __all__ = [
+    "LOST_S",
     "Apart",
     "Evidence",
     "ForceAgreement",

@@ -100,8 +100,7 @@ class Evidence:
     accel_noise: float | None = None  # m/s^2/sqrt(Hz)
     rate_hz: float | None = None
     rate_told_hz: float | None = None
-    longest_gap_s: float = 0.0
-    max_gap_s: float = 0.1  # that is no outage
+    max_gap_s: float = 0.1  # between samples, that is no outage
     saturated: tuple[str, ...] = ()
     force_m_s2: float | None = None  # usual norm of what the accelerometer reads
     gravity_m_s2: float = 9.81

@@ -10,25 +10,30 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.messages import Array, Frame, ImageU8, ImuSample
-from vislam.sim.faults.disturbance import PERSON_M, person_box
+from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.faults.moment import Event, Moment, Stream, changed
 
 _STEPS = (1.0, 0.4, 1.6, 0.7)  # gains, one after the other
 _STEP_S = 1.5
 _SALT = 0.05  # of the pixels
+_HICCUPS = 0.1  # of the frames
 _COVERED, _GRAIN = 40.0, 2.0  # grey and its noise behind a hand
+
+
+def framed(change: Callable[[Frame, Moment], Frame | None]) -> Stream:
+    """Return the fault that changes every frame; None: it never arrives."""
+    return changed(Frame, lambda frame, moment, _: [new for new in [change(frame, moment)] if new is not None])
 
 
 def pictures(change: Callable[[ImageU8, Moment, float], ImageU8], camera: int | None = None) -> Stream:
     """Return the fault that changes images [H, W], all or those of one camera, by the moment and the time since it."""
 
-    def frame(value: Frame, moment: Moment) -> Frame:
-        since_s = (value.t_ns - moment.from_ns) * 1e-9
-        return replace(value, images=tuple(
-            change(image, moment, since_s) if camera in (None, k) else image for k, image in enumerate(value.images)
-        ))  # fmt: skip
+    def pictured(frame: Frame, moment: Moment) -> Frame:
+        since_s = (frame.t_ns - moment.from_ns) * 1e-9
+        images = enumerate(frame.images)
+        return replace(frame, images=tuple(change(i, moment, since_s) if camera in (None, k) else i for k, i in images))
 
-    return changed(Frame, frame)
+    return framed(pictured)
 
 
 def _even(level: int) -> Callable[[ImageU8, Moment, float], ImageU8]:
@@ -56,14 +61,14 @@ BLACK, WHITE, ONE_BLACK = pictures(_even(0)), pictures(_even(255)), pictures(_ev
 GAIN = pictures(lambda image, _, since_s: _gained(image, _STEPS[int(since_s / _STEP_S) % len(_STEPS)]))
 DIMMED = pictures(lambda image, _, __: _gained(image, _STEPS[1]))
 BLURRED, SALTED, COVERED = pictures(_blurred), pictures(_salted), pictures(_covered)
-ONE_GONE = changed(Frame, lambda frame, _: replace(frame, images=frame.images[:1]))
-NO_DEPTH = changed(Frame, lambda f, _: f if f.depth_m is None else replace(f, depth_m=np.zeros_like(f.depth_m)))
-LONG_DEPTH = changed(Frame, lambda f, _: f if f.depth_m is None else replace(f, depth_m=f.depth_m * np.float32(1.05)))
+ONE_GONE = framed(lambda frame, _: replace(frame, images=frame.images[:1]))
+NO_DEPTH = framed(lambda f, _: f if f.depth_m is None else replace(f, depth_m=np.zeros_like(f.depth_m)))
+LONG_DEPTH = framed(lambda f, _: f if f.depth_m is None else replace(f, depth_m=f.depth_m * np.float32(1.05)))
 
 
 def some_dropped(share: float) -> Stream:
     """Return the fault that a share of the frames never arrives."""
-    return changed(Frame, lambda frame, moment: frame if moment.rng.random() >= share else None)
+    return framed(lambda frame, moment: frame if moment.rng.random() >= share else None)
 
 
 def as_before(before: Frame, frame: Frame) -> Frame:
@@ -71,53 +76,38 @@ def as_before(before: Frame, frame: Frame) -> Frame:
     return replace(before, t_ns=frame.t_ns, index=frame.index)
 
 
-def now_and_then(events: Iterator[Event], moment: Moment) -> Iterator[Event]:
-    """Repeat the frame before in one of ten frames."""
-    before: Frame | None = None
-    for value in events:
-        if not isinstance(value, Frame):
-            yield value
-            continue
-        is_repeated = before is not None and moment.has(value.t_ns) and moment.rng.random() < 0.1
-        before = as_before(before, value) if before is not None and is_repeated else value
-        yield before
+def _hiccup(frame: Frame, moment: Moment, kept: list[Frame]) -> list[Frame]:
+    kept[:] = [as_before(kept[0], frame) if kept and moment.rng.random() < _HICCUPS else frame]
+    return [*kept]
 
 
-def swapped(frame: Frame, _: Moment) -> Frame:
-    """Return a frame with left and right exchanged."""
+HICCUPS = changed(Frame, _hiccup)
+
+
+def _swapped(frame: Frame, _: Moment) -> Frame:
     tracks = frame.tracks
     if tracks is not None and tracks.right_px is not None:
         tracks = replace(tracks, pixels_px=tracks.right_px, right_px=tracks.pixels_px)
     return replace(frame, images=frame.images[::-1], tracks=tracks)
 
 
+SWAPPED = framed(_swapped)
+
+
 def person(events: Iterator[Event], moment: Moment) -> Iterator[Event]:
     """Put a person over a half of the image who walks to and fro 2 m away, dressed in a pattern."""
-    rig = moment.rig
-    size = (rig.cameras[0].height, rig.cameras[0].width)
-    cloth = sum(cv2.resize(moment.rng.random((size[0] // n, size[1] // n)), size[::-1]) for n in (4, 12, 36))
-    cloth_u8 = (cloth * (255.0 / 3.0)).astype(np.uint8)
-    shift_px = rig.cameras[0].fx * float(np.linalg.norm(rig.T_cam0_cam1[:3, 3])) / PERSON_M if rig.is_stereo else 0.0
+    options = DisturbanceOptions(0.0, 0.0, 0.0, 0.0, 0.0, moving_share=0.5, moving_begin_s=0.0, moving_length_s=np.inf)
+    walking = Disturbance(moment.rig, options, np.random.SeedSequence(int(moment.rng.integers(1 << 31))))
 
-    def dressed(frame: Frame, _: Moment) -> Frame:
-        box = person_box(rig.cameras[0], 0.5, (frame.t_ns - moment.from_ns) * 1e-9)
-        images = tuple(_dressed(im, cloth_u8, box, k * shift_px) for k, im in enumerate(frame.images))
-        depth = None if frame.depth_m is None else frame.depth_m.copy()
-        if depth is not None:
-            left, right = np.clip((box[0, 0] + np.array([-1, 1]) * box[1, 0]).astype(int), 0, size[1])
-            depth[:, left:right] = PERSON_M
-        return replace(frame, images=images, depth_m=depth)
+    def met(frame: Frame, _: Moment) -> Frame:
+        since_s = (frame.t_ns - moment.from_ns) * 1e-9
+        depth_m = np.zeros(frame.images[0].shape, np.float32) if frame.depth_m is None else frame.depth_m
+        lights = [np.repeat(image[..., None], 3, axis=2).astype(np.float32) for image in frame.images]
+        seen = [walking.spoil(k, since_s, light, depth_m) for k, light in enumerate(lights)]
+        images = tuple(light[..., 0].astype(np.uint8) for light, _ in seen)
+        return replace(frame, images=images, depth_m=None if frame.depth_m is None else seen[0][1])
 
-    return changed(Frame, dressed)(events, moment)
-
-
-def _dressed(image: ImageU8, cloth: ImageU8, box: Array, shift_px: float) -> ImageU8:
-    middle, half = box[0, 0] - shift_px, box[1, 0]
-    left, right = np.clip([round(middle - half), round(middle + half)], 0, image.shape[1])
-    begin = max(round(half - middle), 0)  # of the cloth, where the person stands half outside
-    out = image.copy()
-    out[:, left:right] = cloth[: image.shape[0], begin : begin + right - left]
-    return out
+    return framed(met)(events, moment)
 
 
 def rolling(events: Iterator[Event], moment: Moment, readout_s: float) -> Iterator[Event]:

@@ -24,7 +24,7 @@ from vislam.core.streams import Happening, StreamJudge
 from vislam.core.trajectory import Trajectory
 from vislam.sim.faults import camera_faults as cam
 from vislam.sim.faults import inertial_faults as imu
-from vislam.sim.faults.moment import Event, Moment, Stream, again, changed, ended, glued, gone, held, stepped
+from vislam.sim.faults.moment import Event, Moment, Stream, again, glued, gone, held, stepped
 
 _NS = 1_000_000_000
 _BEGIN_S = 5.0  # after the first frame: the run has begun by then, and was right so far
@@ -42,11 +42,11 @@ class Fault:
     words: str
     needs: frozenset[str]
     stream: Stream | None = None
-    rig: Callable[[Rig], Rig] | None = None
     lasts_s: tuple[float, float] | None = None  # least and most; None: it is there from the beginning to the end
-    named: tuple[tuple[str, Happening | None], ...] = ()  # events that it is; None: of a kind that there is none for
+    named: tuple[str, ...] = ()  # events that it is, as "imu0 hole"; "?": there is no kind for it yet
     spares: frozenset[str] | None = None  # needs of a recording whose other values suffice; None: they never do
     steps_s: float = 0.0  # by which frames after it are stamped later
+    rig: Callable[[Rig], Rig] | None = None
 
     def fits(self, recording: Recording, has_images: bool) -> bool:
         """Whether a recording has what the fault is about."""
@@ -191,19 +191,7 @@ def _needs(*names: str) -> frozenset[str]:
 _ANY, _IMU, _IMAGES, _PAIR = _needs(), _needs("imu"), _needs("images"), _needs("images", "stereo")
 _SCALE, _RGBD = _needs("scale"), _needs("images", "depth")
 _ON, _LONG = (2 * _EVER_S, 2 * _EVER_S), (1.0, 3.0)
-
-
-def _break(
-    words: str, needs: frozenset[str], stream: Stream, lasts_s: tuple[float, float] = _ON, named: str = "",
-    spares: frozenset[str] | None = None, steps_s: float = 0.0,
-) -> Fault:  # fmt: skip
-    """Return a fault that begins at some moment; `named` is "stream: happening, ..." of the events that it is."""
-    events = (event.split(": ") for event in named.split(", ") if event)
-    pairs = tuple((s, None if h == "?" else Happening(h)) for s, h in events)
-    return Fault(words, needs, stream, None, lasts_s, pairs, spares, steps_s)
-
-
-_BOTH_BACK, _BOTH_HOLE = "imu0: step back, cam0: step back", "imu0: hole, cam0: hole"
+_BOTH_BACK, _BOTH_HOLE = ("imu0 step back", "cam0 step back"), ("imu0 hole", "cam0 hole")
 
 # what is there from the beginning to the end: calibration, units, mounting
 _THROUGHOUT: Mapping[str, Fault] = {
@@ -211,76 +199,75 @@ _THROUGHOUT: Mapping[str, Fault] = {
         cam.rolling, readout_s=0.03)),
     "depth": Fault("depth 5 % too long", _RGBD, cam.LONG_DEPTH),
     "dropped": Fault("a fifth of the frames never arrives", _ANY, cam.some_dropped(0.2)),
-    "late": Fault("the camera's clock is 20 ms late", _IMU, stepped(0.02, Frame)),
-    "swapped": Fault("the cables of a stereo pair are swapped", _needs("stereo"), changed(Frame, cam.swapped)),
-    "turned": Fault("the camera is stated 3 degrees wrong on the body", _IMU, None, partial(_turned, deg=3.0)),
-    "focal": Fault("focal length 2 % too long", _ANY, None, partial(_focal, factor=1.02)),
-    "slow": Fault("a quarter of the inertial samples arrives", _IMU, imu.every(4)),
+    "late": Fault("the camera's clock is 20 ms late", _IMU, stepped(Frame, 0.02)),
+    "swapped": Fault("the cables of a stereo pair are swapped", _needs("stereo"), cam.SWAPPED),
+    "turned": Fault("the camera is stated 3 degrees wrong on the body", _IMU, rig=partial(_turned, deg=3.0)),
+    "focal": Fault("focal length 2 % too long", _ANY, rig=partial(_focal, factor=1.02)),
+    "slow": Fault("a quarter of the inertial samples arrives", _IMU, imu.thinned(4)),
     "in g": Fault("the accelerometer is in g, not m/s^2", _IMU, imu.IN_G),
     "flipped": Fault("the y axis of the unit has the wrong sign", _IMU, imu.scaled(1, -1, 1, 1, -1, 1)),
     "gyro flipped": Fault("the gyro's z axis has the wrong sign", _IMU, imu.scaled(1, 1, -1, 1, 1, 1)),
     "stretched": Fault("the accelerometer reads 5 % too much", _IMU, imu.STRETCHED),
-    "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY),
-    "vibration": Fault("the vibration of a propeller, aliased", _IMU, imu.SHAKEN),
-    "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED),
-    "salt": Fault("5 % of the pixels are salt and pepper", _IMAGES, cam.SALTED),
-    "gain": Fault("exposure jumps every 1.5 s", _IMAGES, cam.GAIN),
 }  # fmt: skip
 
 # what begins at some moment
 BREAKS: Mapping[str, Fault] = {
-    "person": _break("a person over half of the image", _IMAGES, cam.person),
-    **{f"imu hole {s}": _break(f"no inertial sample for {s} s", _IMU, gone(ImuSample), (s, s), "imu0: hole", _ANY)
+    "person": Fault("a person over half of the image", _IMAGES, cam.person, _ON),
+    **{f"imu hole {s}": Fault(f"no inertial sample for {s} s", _IMU, gone(ImuSample), (s, s), ("imu0 hole",), _ANY)
        for s in (0.3, 1.0, 3.0)},
-    "camera hole 0.3": _break("no frame for 0.3 s", _ANY, gone(Frame), (0.3, 0.3), "cam0: hole", _IMU),
-    **{f"camera hole {s}": _break(f"no frame for {s} s", _ANY, gone(Frame), (s, s), "cam0: hole") for s in (1.0, 3.0)},
-    "hole": _break("nothing arrives", _IMU, gone(object), _LONG, _BOTH_HOLE),
-    "all back 5": _break("all clocks step back by 5 s", _IMU, stepped(-5.0, object), _ON, _BOTH_BACK, None, -5.0),
-    "all back 1": _break("all clocks step back by 1 s", _IMU, stepped(-1.0, object), _ON, _BOTH_BACK, None, -1.0),
-    "all forth": _break("all clocks step forth by 5 s", _IMU, stepped(5.0, object), _ON, _BOTH_HOLE, None, 5.0),
-    "camera back": _break("the camera's clock steps back by 1 s", _ANY, stepped(-1.0, Frame), _ON,
-        "cam0: step back", None, -1.0),
-    "camera forth": _break("the camera's clock steps forth by 1 s", _ANY, stepped(1.0, Frame), _ON, "cam0: hole",
+    "camera hole 0.3": Fault("no frame for 0.3 s", _ANY, gone(Frame), (0.3, 0.3), ("cam0 hole",), _IMU),
+    **{f"camera hole {s}": Fault(f"no frame for {s} s", _ANY, gone(Frame), (s, s), ("cam0 hole",)) for s in (1.0, 3.0)},
+    "hole": Fault("nothing arrives", _IMU, gone(object), _LONG, _BOTH_HOLE),
+    "all back 5": Fault("all clocks step back by 5 s", _IMU, stepped(object, -5.0), _ON, _BOTH_BACK, None, -5.0),
+    "all back 1": Fault("all clocks step back by 1 s", _IMU, stepped(object, -1.0), _ON, _BOTH_BACK, None, -1.0),
+    "all forth": Fault("all clocks step forth by 5 s", _IMU, stepped(object, 5.0), _ON, _BOTH_HOLE, None, 5.0),
+    "camera back": Fault("the camera's clock steps back by 1 s", _ANY, stepped(Frame, -1.0), _ON,
+        ("cam0 step back",), None, -1.0),
+    "camera forth": Fault("the camera's clock steps forth by 1 s", _ANY, stepped(Frame, 1.0), _ON, ("cam0 hole",),
         None, 1.0),
-    "imu back": _break("the IMU's clock steps back by 1 s", _IMU, stepped(-1.0, ImuSample), _ON,
-        "imu0: step back", _SCALE),
-    "imu forth": _break("the IMU's clock steps forth by 1 s", _IMU, stepped(1.0, ImuSample), _ON, "imu0: hole", _SCALE),
-    "again": _break("the log is played twice", _ANY, again, _ON, "cam0: step back"),
-    "glued": _break("two logs as one, stamps go on as if nothing were", _ANY, glued, (2.0, 2.0), "cam0: ?", None, -2.0),
-    "ended": _break("the end is missing", _ANY, ended, _ON, "", _ANY),
-    "stuck": _break("one inertial sample again and again", _IMU, held(
-        ImuSample, lambda first, row: replace(first, t_ns=row.t_ns)), _ON, "imu0: stuck", _SCALE),
-    "axis stuck": _break("the gyro's z axis repeats one value", _IMU, held(ImuSample, lambda first, row: replace(
-        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, "imu0: ?", _SCALE),
-    "twice": _break("half of the inertial rows come twice", _IMU, imu.twice, _LONG, "imu0: duplicate", _ANY),
-    "repeated": _break("every other sample is the one before", _IMU, imu.every(2, is_kept=True), _LONG, "", _SCALE),
-    "disordered": _break("one inertial row in fifty is late", _IMU, imu.disordered, _ON, "imu0: late", _ANY),
-    "no number": _break("inertial rows are NaN", _IMU, imu.NO_NUMBER, _LONG, "imu0: unusable", _ANY),
-    "bursts": _break("inertial rows come in bursts, stamped then", _IMU, imu.in_bursts, _ON, "imu0: ?", _SCALE),
-    "coarse": _break("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, "imu0: duplicate", _SCALE),
-    "halved": _break("every other inertial sample is missing", _IMU, imu.every(2), _ON, "imu0: ?", _ANY),
-    "clips": _break("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, "imu0: ?", _SCALE),
-    "shaken": _break("the vibration of a propeller, aliased", _IMU, imu.SHAKEN, _ON),
-    "spikes": _break("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, "imu0: ?", _SCALE),
-    "reconnected": _break("the IMU comes back with two axes turned", _IMU, imu.scaled(-1, -1, 1, -1, -1, 1), _ON,
-        "imu0: ?", _SCALE),
-    "now in g": _break("the IMU comes back with another unit", _IMU, imu.IN_G, _ON, "imu0: ?", _SCALE),
-    "black": _break("black images", _IMAGES, cam.BLACK, _LONG, "cam0: dark"),
-    "white": _break("white images", _IMAGES, cam.WHITE, _LONG, "cam0: ?"),
-    "covered": _break("a hand on the lens", _IMAGES, cam.COVERED, _LONG, "cam0: ?"),
-    "frozen": _break("the same image again and again", _IMAGES, held(Frame, cam.as_before), _LONG, "cam0: repeated"),
-    "now and then": _break("one image in ten repeats the one before", _IMAGES, cam.now_and_then, _ON, "", _ANY),
-    "blur": _break("out of focus", _IMAGES, cam.BLURRED, _LONG, "cam0: ?"),
-    "dimmed": _break("exposure falls to 40 %", _IMAGES, cam.DIMMED, _ON, "", _ANY),
-    "half dropped": _break("half of the frames never arrives", _ANY, cam.some_dropped(0.5), _LONG, "", _IMU),
-    "one black": _break("one camera of two is black", _PAIR, cam.ONE_BLACK, _LONG, "cam1: dark", _IMU),
-    "one frozen": _break("one camera of two repeats one image", _PAIR, held(Frame, lambda first, frame: replace(
-        frame, images=(frame.images[0], *first.images[1:]))), _LONG, "cam1: repeated", _IMU),
-    "one gone": _break("one camera of two sends nothing", _PAIR, cam.ONE_GONE, _LONG, "cam1: hole", _IMU),
-    "crossed": _break("left and right are exchanged", _needs("stereo"), changed(Frame, cam.swapped), _ON, "cam0: ?"),
-    "no depth": _break("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, "depth0: ?"),
-    "frozen depth": _break("the same depth image again and again", _RGBD, held(
-        Frame, lambda first, frame: replace(frame, depth_m=first.depth_m)), _LONG, "depth0: repeated"),
+    "imu back": Fault("the IMU's clock steps back by 1 s", _IMU, stepped(ImuSample, -1.0), _ON,
+        ("imu0 step back",), _SCALE),
+    "imu forth": Fault("the IMU's clock steps forth by 1 s", _IMU, stepped(ImuSample, 1.0), _ON,
+        ("imu0 hole",), _SCALE),
+    "again": Fault("the log is played twice", _ANY, again, _ON, ("cam0 step back",)),
+    "glued": Fault("two logs as one, stamps go on as if they were", _ANY, glued, (2.0, 2.0), ("cam0 ?",), None, -2.0),
+    "ended": Fault("the end is missing", _ANY, gone(object), _ON, (), _ANY),
+    "stuck": Fault("one inertial sample again and again", _IMU, held(
+        ImuSample, lambda first, row: replace(first, t_ns=row.t_ns)), _ON, ("imu0 stuck",), _SCALE),
+    "axis stuck": Fault("the gyro's z axis repeats one value", _IMU, held(ImuSample, lambda first, row: replace(
+        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, ("imu0 ?",), _SCALE),
+    "twice": Fault("half of the inertial rows come twice", _IMU, imu.TWICE, _LONG, ("imu0 duplicate",), _ANY),
+    "repeated": Fault("every other sample is the one before", _IMU, imu.TWINS, _LONG, (), _SCALE),
+    "disordered": Fault("one inertial row in fifty is late", _IMU, imu.DISORDERED, _ON, ("imu0 late",), _ANY),
+    "no number": Fault("inertial rows are NaN", _IMU, imu.NO_NUMBER, _LONG, ("imu0 unusable",), _ANY),
+    "bursts": Fault("inertial rows come in bursts, stamped then", _IMU, imu.BURSTS, _ON, ("imu0 ?",), _SCALE),
+    "coarse": Fault("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, ("imu0 duplicate",), _SCALE),
+    "halved": Fault("every other inertial sample is missing", _IMU, imu.thinned(2), _ON, ("imu0 ?",), _ANY),
+    "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, ("imu0 ?",), _SCALE),
+    "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY, _ON),
+    "vibration": Fault("the vibration of a propeller, aliased", _IMU, imu.SHAKEN, _ON),
+    "spikes": Fault("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, ("imu0 ?",), _SCALE),
+    "reconnected": Fault("the IMU comes back with two axes turned", _IMU, imu.scaled(-1, -1, 1, -1, -1, 1), _ON,
+        ("imu0 ?",), _SCALE),
+    "now in g": Fault("the IMU comes back with another unit", _IMU, imu.IN_G, _ON, ("imu0 ?",), _SCALE),
+    "black": Fault("black images", _IMAGES, cam.BLACK, _LONG, ("cam0 dark",)),
+    "white": Fault("white images", _IMAGES, cam.WHITE, _LONG, ("cam0 ?",)),
+    "covered": Fault("a hand on the lens", _IMAGES, cam.COVERED, _LONG, ("cam0 ?",)),
+    "frozen": Fault("the same image again and again", _IMAGES, held(Frame, cam.as_before), _LONG, ("cam0 repeated",)),
+    "now and then": Fault("one image in ten repeats the one before", _IMAGES, cam.HICCUPS, _ON, (), _ANY),
+    "salt": Fault("5 % of the pixels are salt and pepper", _IMAGES, cam.SALTED, _ON),
+    "gain": Fault("exposure jumps every 1.5 s", _IMAGES, cam.GAIN, _ON, (), _ANY),
+    "blur": Fault("out of focus", _IMAGES, cam.BLURRED, _LONG, ("cam0 ?",)),
+    "dimmed": Fault("exposure falls to 40 %", _IMAGES, cam.DIMMED, _ON, (), _ANY),
+    "half dropped": Fault("half of the frames never arrives", _ANY, cam.some_dropped(0.5), _LONG, (), _IMU),
+    "one black": Fault("one camera of two is black", _PAIR, cam.ONE_BLACK, _LONG, ("cam1 dark",), _IMU),
+    "one frozen": Fault("one camera of two repeats one image", _PAIR, held(Frame, lambda first, frame: replace(
+        frame, images=(frame.images[0], *first.images[1:]))), _LONG, ("cam1 repeated",), _IMU),
+    "one gone": Fault("one camera of two sends nothing", _PAIR, cam.ONE_GONE, _LONG, ("cam1 hole",), _IMU),
+    "crossed": Fault("left and right are exchanged", _needs("stereo"), cam.SWAPPED, _ON, ("cam0 ?",)),
+    "no depth": Fault("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, ("depth0 ?",)),
+    "frozen depth": Fault("the same depth image again and again", _RGBD, held(
+        Frame, lambda first, frame: replace(frame, depth_m=first.depth_m)), _LONG, ("depth0 repeated",)),
 }  # fmt: skip
 
 FAULTS: Mapping[str, Fault] = {**_THROUGHOUT, **BREAKS}
