@@ -115,6 +115,12 @@ def test_what_happened_to_a_sensor_is_said_before_what_came_of_it():
     assert found.reasons[0].startswith("imu0: stuck")
 
 
+def test_a_hole_that_was_bridged_is_no_doubt_but_the_first_cause_of_one():
+    assert verdict(causes=("cam0: rows are missing",)).state is Trust.TRUSTED
+    assert verdict(causes=("cam0: rows are missing",)).reasons == ()
+    assert verdict(causes=("cam0: rows are missing",), soft_resets=2).reasons[0] == "cam0: rows are missing"
+
+
 def test_what_calibration_corrected_is_told_without_a_doubt():
     found = verdict(clock=Moved(-0.02, 0.0005), rotation=Moved(1.2, 0.1))
     assert found.state is Trust.TRUSTED

@@ -101,14 +101,15 @@ def test_a_faulty_stream_is_the_same_again_and_in_order():
         assert [t_ns for _, t_ns in values] == sorted(t_ns for _, t_ns in values), fault
 
 
-def test_a_hole_is_a_doubt_where_it_is_as_long_as_what_the_other_sensors_cannot_bridge():
-    def reasons(stream, lasts_s):
+def test_a_hole_is_a_doubt_of_the_imu_and_a_cause_of_the_camera():
+    def found(stream, lasts_s):
         hole = StreamEvent(stream, Happening.HOLE, 2_000_000_000, 2_000_000_000 + round(lasts_s * 1e9), 3)
-        return evidence_of(events=(hole,)).events
+        return evidence_of(events=(hole,))
 
-    assert reasons("cam0", 0.9) == reasons("imu0", 0.09) == ()
-    assert "cam0: rows are missing from 2.00 to 3.10 s" in reasons("cam0", 1.1)[0]
-    assert "imu0: rows are missing from 2.00 to 2.20 s" in reasons("imu0", 0.2)[0]
+    assert found("imu0", 0.09).events == found("cam0", 5.0).events == ()
+    assert found("cam0", 0.9).causes == found("imu0", 5.0).causes == ()
+    assert "imu0: rows are missing from 2.00 to 2.20 s" in found("imu0", 0.2).events[0]
+    assert "cam0: rows are missing from 2.00 to 3.10 s" in found("cam0", 1.1).causes[0]
 
 
 def test_dark_images_are_not_those_of_a_stuck_driver():

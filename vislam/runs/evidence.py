@@ -73,6 +73,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         gravity_m_s2=machine.gravity_m_s2,
         max_gap_s=machine.max_gap_s,
         events=tuple(_together([e for e in report.events if _matters(e, machine.max_gap_s)], report.first_t_ns)),
+        causes=tuple(_together([e for e in report.events if _may_explain(e)], report.first_t_ns)),
         **_calibration(report.calibration),
     )
     condition, noise, given = report.condition, report.noise_ratios, report.told_noise
@@ -92,8 +93,13 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
 def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
     if event.happening in (Happening.STUCK, Happening.UNUSABLE, Happening.HOLE):
-        return _lasted_s(event) > (LOST_S if event.stream.startswith("cam") else max_gap_s)
+        return not event.stream.startswith("cam") and _lasted_s(event) > max_gap_s
     return event.tears
+
+
+def _may_explain(event: StreamEvent) -> bool:
+    """Whether an event, no doubt by itself, may be the cause of others: a camera's hole, or its clock leapt."""
+    return event.happening is Happening.HOLE and event.stream.startswith("cam") and _lasted_s(event) > LOST_S
 
 
 def _lasted_s(event: StreamEvent) -> float:

@@ -44,6 +44,7 @@ class Evidence:
     """The evidence of a run so far. Defaults are those of a run about which nothing is known and nothing wrong."""
 
     events: tuple[str, ...] = ()  # in streams of sensors, that leave less to go on
+    causes: tuple[str, ...] = ()  # events that are no doubt by themselves, but explain others
     # vision
     mode: str = ""
     frames: int = 0

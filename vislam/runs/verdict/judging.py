@@ -76,7 +76,8 @@ def judge(evidence: Evidence, config: VerdictConfig) -> Verdict:
     slow, lost = tuple(_slow(evidence, config)), tuple(_lost(evidence, config))
     reasons = tuple(reason for test in _TESTS for reason in test(evidence, config))
     state = Trust.LOST if lost else Trust.DOUBTFUL if slow or reasons else Trust.TRUSTED
-    return Verdict(state, slow + lost + reasons, tuple(_moved(evidence, config)))
+    causes = evidence.causes if lost or reasons else ()
+    return Verdict(state, slow + causes + lost + reasons, tuple(_moved(evidence, config)))
 
 
 def _slow(e: Evidence, _: VerdictConfig) -> Iterator[str]:

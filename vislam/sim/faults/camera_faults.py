@@ -36,16 +36,8 @@ def pictures(change: Callable[[ImageU8, Moment, float], ImageU8], camera: int | 
     return framed(pictured)
 
 
-def _even(level: int) -> Callable[[ImageU8, Moment, float], ImageU8]:
-    return lambda image, _, __: np.full_like(image, level)
-
-
 def _gained(image: ImageU8, gain: float) -> ImageU8:
     return np.clip(image * gain, 0.0, 255.0).astype(np.uint8)
-
-
-def _blurred(image: ImageU8, _: Moment, __: float) -> ImageU8:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 3.0), dtype=np.uint8)
 
 
 def _salted(image: ImageU8, moment: Moment, _: float) -> ImageU8:
@@ -53,14 +45,13 @@ def _salted(image: ImageU8, moment: Moment, _: float) -> ImageU8:
     return np.where(drawn < 0.5 * _SALT, 0, np.where(drawn > 1.0 - 0.5 * _SALT, 255, image)).astype(np.uint8)
 
 
-def _covered(image: ImageU8, moment: Moment, _: float) -> ImageU8:
-    return np.clip(_COVERED + _GRAIN * moment.rng.standard_normal(image.shape), 0.0, 255.0).astype(np.uint8)
-
-
-BLACK, WHITE, ONE_BLACK = pictures(_even(0)), pictures(_even(255)), pictures(_even(0), 1)
+BLACK, ONE_BLACK = (pictures(lambda image, _, __: np.zeros_like(image), camera) for camera in (None, 1))
+WHITE = pictures(lambda image, _, __: np.full_like(image, 255))
 GAIN = pictures(lambda image, _, since_s: _gained(image, _STEPS[int(since_s / _STEP_S) % len(_STEPS)]))
 DIMMED = pictures(lambda image, _, __: _gained(image, _STEPS[1]))
-BLURRED, SALTED, COVERED = pictures(_blurred), pictures(_salted), pictures(_covered)
+BLURRED = pictures(lambda image, _, __: np.asarray(cv2.GaussianBlur(image, (0, 0), 3.0), np.uint8))
+COVERED = pictures(lambda image, m, __: (_COVERED + _GRAIN * m.rng.standard_normal(image.shape)).astype(np.uint8))
+SALTED = pictures(_salted)
 ONE_GONE = framed(lambda frame, _: replace(frame, images=frame.images[:1]))
 NO_DEPTH = framed(lambda f, _: f if f.depth_m is None else replace(f, depth_m=np.zeros_like(f.depth_m)))
 LONG_DEPTH = framed(lambda f, _: f if f.depth_m is None else replace(f, depth_m=f.depth_m * np.float32(1.05)))

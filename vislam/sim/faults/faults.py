@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, takewhile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -58,9 +58,9 @@ class Fault:
 
 
 def _has(recording: Recording) -> set[str]:
-    rig = recording.rig
-    has = {"imu": recording.imu_noise is not None, "stereo": rig.is_stereo, "depth": rig.has_depth}
-    return {name for name, there in (has | {"scale": rig.is_stereo or rig.has_depth}).items() if there}
+    stereo, depth = recording.rig.is_stereo, recording.rig.has_depth
+    has = {"imu": recording.imu_noise is not None, "stereo": stereo, "depth": depth, "scale": stereo or depth}
+    return {name for name, there in has.items() if there}
 
 
 class _Judged(dict[str, int]):
@@ -111,11 +111,12 @@ class FaultyRecording(WrappedRecording):
     def events(self, from_ns: int | None = None) -> Iterator[Event]:
         """Yield the values with their fault, all of them: what `from_ns` leaves out would change what is random."""
         events: Iterator[Event] = iter(self._recording.events())
-        before = list(_until_frame(events))
+        before: list[Event] = []
+        while not (before and isinstance(before[-1], Frame)) and (value := next(events, None)) is not None:
+            before.append(value)
         self._first_ns = before[-1].t_ns if before else 0
-        events = chain(before, events)
-        if self._length_s is not None:
-            events = _cut(events, self._first_ns + round(self._length_s * _NS))
+        end_ns = self._ns(_EVER_S if self._length_s is None else self._length_s)
+        events = takewhile(lambda value: value.t_ns <= end_ns, chain(before, events))
         if self.fault.stream is None:
             return events
         moment = Moment(self._ns(self.from_s), self._ns(self.to_s), np.random.default_rng(self._seed), self.rig)
@@ -135,20 +136,6 @@ class FaultyRecording(WrappedRecording):
 
     def _ns(self, since_s: float) -> int:
         return self._first_ns + round(since_s * _NS)
-
-
-def _until_frame(events: Iterator[Event]) -> Iterator[Event]:
-    for value in events:
-        yield value
-        if isinstance(value, Frame):
-            return
-
-
-def _cut(events: Iterable[Event], end_ns: int) -> Iterator[Event]:
-    for value in events:
-        if value.t_ns > end_ns:
-            return
-        yield value
 
 
 def _as_read(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iterator[Event]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, takewhile
 from typing import Any
 
 import numpy as np
@@ -62,17 +63,12 @@ def held(kind: type, hold: Callable[[Any, Any], Any]) -> Stream:
 
 def again(events: Iterator[Event], moment: Moment) -> Iterator[Event]:
     """Play the log up to the moment, and then the same once more, as a player does that loops."""
-    played = []
-    for value in events:
-        if value.t_ns >= moment.from_ns:
-            break
-        played.append(value)
-        yield value
-    yield from played
+    played = list(takewhile(lambda value: value.t_ns < moment.from_ns, events))
+    return chain(played, played)
 
 
 def glued(events: Iterator[Event], moment: Moment) -> Iterator[Event]:
     """Cut the moment out and move what follows into its place: two logs as one, whose stamps do not show the seam."""
-    for value in gone(object)(events, moment):
-        is_late = value.t_ns >= moment.to_ns
-        yield replace(value, t_ns=value.t_ns - moment.to_ns + moment.from_ns) if is_late else value
+    early_ns = moment.to_ns - moment.from_ns
+    rest = gone(object)(events, moment)
+    return (replace(v, t_ns=v.t_ns - early_ns) if v.t_ns >= moment.to_ns else v for v in rest)
