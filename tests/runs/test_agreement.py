@@ -98,6 +98,16 @@ def test_outlying_turns_do_not_decide(steps):
     assert abs(found.scale_error) < 4.0 * found.scale_sigma
 
 
+def test_a_gyro_axis_that_stands_still_for_a_third_of_the_way_shows_in_the_worst_turns(steps):
+    poses, spans = steps()
+    sound = turn_agreement(list(seen_turns(poses, spans)))
+    assert sound.worst_rad < np.deg2rad(0.5)
+    spans[33:] = [replace(s, gyro_rad_s=s.gyro_rad_s * [1.0, 1.0, 0.0]) for s in spans[33:]]
+    found = turn_agreement(list(seen_turns(poses, spans)))
+    assert found.worst_rad > np.deg2rad(3.0)
+    assert abs(found.scale_error) < 4.0 * found.scale_sigma  # while most turns agree
+
+
 def forces(poses, spans):
     bias = np.array([0.01, -0.02, 0.03])
     inertial = [preintegrate(span, gyro_bias_rad_s=bias) for span in spans]

@@ -70,6 +70,10 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"clock": Moved(0.08, 0.0005)}, "80.0 ± 0.5 ms early"),
         ({"rotation": Moved(3.0, 0.1)}, "the camera is turned by 3.0 degrees against its file: calibrate"),
         ({"turns": TurnAgreement(50, -0.03, 0.002, 1e-3)}, "vision sees turns 3.0 % smaller"),
+        (
+            {"turns": TurnAgreement(50, 0.0, 0.002, 1e-3, 0.05)},
+            "one in ten turns between keyframes is 2.9 degrees",
+        ),
         ({"forces": ForceAgreement(50, 1.05, 0.002, 9.8, 0.02, 0.2)}, "metres are 5.0 % larger"),
         ({"forces": ForceAgreement(50, 1.0, 0.002, 10.3, 0.02, 0.2)}, "gravity along the way is 10.30"),
         ({"gyro_noise": 0.05}, "gyroscope noise is 2.9 deg after a second"),
@@ -119,6 +123,11 @@ def test_a_hole_that_was_bridged_is_no_doubt_but_the_first_cause_of_one():
     assert verdict(causes=("cam0: rows are missing",)).state is Trust.TRUSTED
     assert verdict(causes=("cam0: rows are missing",)).reasons == ()
     assert verdict(causes=("cam0: rows are missing",), soft_resets=2).reasons[0] == "cam0: rows are missing"
+
+
+def test_no_calibration_is_asked_for_where_turns_contradict_each_other():
+    found = verdict(turns=TurnAgreement(50, 0.03, 0.002, 1e-3, 0.05), rotation=Moved(5.0, 0.1))
+    assert len(found.reasons) == 1 and "one in ten turns" in found.reasons[0]
 
 
 def test_what_calibration_corrected_is_told_without_a_doubt():

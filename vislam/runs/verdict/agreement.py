@@ -17,6 +17,7 @@ from vislam.core.messages import Array
 from vislam.imu import Preintegrated
 
 _MIN_STEPS = 12
+_INLIERS = 0.9
 _ROUNDS = 6
 _CAUCHY = 3.0  # standard deviations
 _LEAST_TURN_RAD = 1e-4  # residuals smaller than this are the rounding of stamps, not what sensors can say
@@ -41,6 +42,7 @@ class TurnAgreement:
     scale_error: float  # by which vision sees turns too large: a wrong focal length, or scale of the gyroscope
     scale_sigma: float
     residual_rad: float  # of a step, what is left
+    worst_rad: float = 0.0  # that nine of ten steps stay below: more than outliers of vision are beyond it
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,8 @@ def turn_agreement(steps: Sequence[TurnStep]) -> TurnAgreement | None:
     sigmas = np.array([*[_BIAS_RAD_S] * 3, *[_TURN_RAD] * 3, _SCALE])
     x, covariance, residual = _robust(rows, errors, sigmas, np.zeros(7), _LEAST_TURN_RAD)
     sigma = np.hypot(np.sqrt(covariance[6, 6]), _dilution(rows[:, :, 6] + rows[:, :, :6] @ x[:6], seen))
-    return TurnAgreement(len(steps), float(x[6]), float(sigma), residual)
+    worst = np.quantile(np.linalg.norm(errors - rows @ x, axis=1), _INLIERS)
+    return TurnAgreement(len(steps), float(x[6]), float(sigma), residual, float(worst))
 
 
 def force_agreement(

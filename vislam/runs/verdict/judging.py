@@ -213,11 +213,17 @@ def _graph(e: Evidence, _: VerdictConfig) -> Iterator[str]:
 
 
 def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    turns, forces = e.turns, e.forces
+    if turns is not None and (apart_deg := math.degrees(turns.worst_rad)) > _GYRO_NOISE_DEG:
+        yield (
+            f"one in ten turns between keyframes is {apart_deg:.1f} degrees or more apart by vision and by gyroscope: "
+            "look at the gyroscope's axes, cable and driver, and for what moves through the image"
+        )
+        return  # what a calibration would be measured by contradicts itself
     if e.rotation is not None and _beyond(e.rotation, c.rotation_sigma_deg, 3, c):
         yield f"the camera is turned by {e.rotation.by:.1f} degrees against its file: calibrate ({_CALIBRATE})"
     if e.clock is not None and _beyond(e.clock, _CLOCK_SIGMA_S, 1, c):
         yield f"{_clock_words(e.clock)}, beyond any driver's delay: set --init.time-offset-s, or {_CALIBRATE}"
-    turns, forces = e.turns, e.forces
     if turns is not None and _beyond(Moved(turns.scale_error, turns.scale_sigma), _TURN_SCALE_SIGMA, 1, c):
         yield (
             f"vision sees turns {_percent(turns.scale_error)} than the gyroscope: focal length or gyro scale is wrong: "
