@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.messages import Frame, ImuSample
-from vislam.core.recording import Recording, WrappedRecording
-from vislam.core.streams import Happening, StreamJudge
+from vislam.core.recording import Problems, Recording, WrappedRecording
+from vislam.core.streams import StreamJudge
 from vislam.core.trajectory import Trajectory
 from vislam.sim.faults import camera_faults as cam
 from vislam.sim.faults import inertial_faults as imu
@@ -61,14 +61,6 @@ def _has(recording: Recording) -> set[str]:
     stereo, depth = recording.rig.is_stereo, recording.rig.has_depth
     has = {"imu": recording.imu_noise is not None, "stereo": stereo, "depth": depth, "scale": stereo or depth}
     return {name for name, there in has.items() if there}
-
-
-class _Judged(dict[str, int]):
-    """What a reader counts, and its judges of streams."""
-
-    def __init__(self, known: Mapping[str, int]) -> None:
-        super().__init__(known)
-        self.judges = {name: StreamJudge(name) for name in ("imu0", "cam0")}
 
 
 class FaultyRecording(WrappedRecording):
@@ -120,7 +112,11 @@ class FaultyRecording(WrappedRecording):
         if self.fault.stream is None:
             return events
         moment = Moment(self._ns(self.from_s), self._ns(self.to_s), np.random.default_rng(self._seed), self.rig)
-        self.problems = judged = _Judged(self._recording.problems)
+        self.problems = judged = Problems()
+        judged.update(self._recording.problems)
+        noise = self._recording.imu_noise
+        imu_hz = 0.0 if noise is None else noise.rate_hz or 0.0
+        judged.judges = {n: StreamJudge(n, rate_hz=hz, recorded=True) for n, hz in (("imu0", imu_hz), ("cam0", 0.0))}
         return _as_read(self.fault.stream(events, moment), judged.judges)
 
     def truth(self) -> Trajectory | None:
@@ -150,7 +146,7 @@ def _as_read(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iter
         if stream in judges and not judges[stream].takes(value.t_ns):
             continue
         if isinstance(value, Frame):
-            steps = (e.from_ns for j in judges.values() for e in j.events if e.happening is Happening.STEP_BACK)
+            steps = (event.from_ns for event in judges[stream].events if event.tears)
             is_torn = last_ns is not None and any(last_ns <= step_ns < value.t_ns for step_ns in steps)
             last_ns, value = value.t_ns, replace(value, follows_step=is_torn)  # noqa: PLW2901
         waiting.setdefault(stream, deque()).append(value)
@@ -216,7 +212,7 @@ BREAKS: Mapping[str, Fault] = {
         ("imu0 step back",), _SCALE),
     "imu forth": Fault("the IMU's clock steps forth by 1 s", _IMU, stepped(ImuSample, 1.0), _ON,
         ("imu0 hole",), _SCALE),
-    "again": Fault("the log is played twice", _ANY, again, _ON, ("cam0 step back",)),
+    "again": Fault("the log is played twice", _ANY, again, _ON, ("cam0 looped",)),
     "glued": Fault("two logs as one, stamps go on as if they were", _ANY, glued, (2.0, 2.0), ("cam0 ?",), None, -2.0),
     "ended": Fault("the end is missing", _ANY, gone(object), _ON, (), _ANY),
     "stuck": Fault("one inertial sample again and again", _IMU, held(
@@ -227,10 +223,10 @@ BREAKS: Mapping[str, Fault] = {
     "repeated": Fault("every other sample is the one before", _IMU, imu.TWINS, _LONG, (), _SCALE),
     "disordered": Fault("one inertial row in fifty is late", _IMU, imu.DISORDERED, _ON, ("imu0 late",), _ANY),
     "no number": Fault("inertial rows are NaN", _IMU, imu.NO_NUMBER, _LONG, ("imu0 unusable",), _ANY),
-    "bursts": Fault("inertial rows come in bursts, stamped then", _IMU, imu.BURSTS, _ON, ("imu0 ?",), _SCALE),
-    "coarse": Fault("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, ("imu0 duplicate",), _SCALE),
-    "halved": Fault("every other inertial sample is missing", _IMU, imu.thinned(2), _ON, ("imu0 ?",), _ANY),
-    "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, ("imu0 ?",), _SCALE),
+    "bursts": Fault("inertial rows come in bursts, stamped then", _IMU, imu.BURSTS, _ON, ("imu0 burst",), _SCALE),
+    "coarse": Fault("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, ("imu0 sawtooth",), _SCALE),
+    "halved": Fault("every other inertial sample is missing", _IMU, imu.thinned(2), _ON, ("imu0 wrong rate",), _ANY),
+    "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, ("imu0 clipped",), _SCALE),
     "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY, _ON),
     "vibration": Fault("the vibration of a propeller, aliased", _IMU, imu.SHAKEN, _ON),
     "spikes": Fault("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, ("imu0 ?",), _SCALE),
@@ -244,7 +240,7 @@ BREAKS: Mapping[str, Fault] = {
     "now and then": Fault("one image in ten repeats the one before", _IMAGES, cam.HICCUPS, _ON, (), _ANY),
     "salt": Fault("5 % of the pixels are salt and pepper", _IMAGES, cam.SALTED, _ON),
     "gain": Fault("exposure jumps every 1.5 s", _IMAGES, cam.GAIN, _ON, (), _ANY),
-    "blur": Fault("out of focus", _IMAGES, cam.BLURRED, _LONG, ("cam0 ?",)),
+    "blur": Fault("out of focus", _IMAGES, cam.BLURRED, _LONG, ("cam0 blurred",)),
     "dimmed": Fault("exposure falls to 40 %", _IMAGES, cam.DIMMED, _ON, (), _ANY),
     "half dropped": Fault("half of the frames never arrives", _ANY, cam.some_dropped(0.5), _LONG, (), _IMU),
     "one black": Fault("one camera of two is black", _PAIR, cam.ONE_BLACK, _LONG, ("cam1 dark",), _IMU),
