@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vislam.core.recording import Problems
+from vislam.core import Problems
 from vislam.datasets import survey
 from vislam.datasets.calibration import camera_text
 from vislam.datasets.rgbd import RgbdFacts, rgbd_facts, rgbd_faults

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from vislam.core import Problems
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES

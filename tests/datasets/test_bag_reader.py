@@ -14,9 +14,9 @@ from rosbags.highlevel import AnyReader
 
 from vislam.cli import run_verb
 from vislam.config import CalibrationConfig
+from vislam.core import Problems
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.inspect import inspect

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vislam.core import Problems
 from vislam.core.errors import DataError, UsageError
 from vislam.core.readings import Reading
-from vislam.core.recording import Problems
 from vislam.datasets.sensor_files import local_frame, sensor_readings
 from vislam.sensors.toml import load_sensor_setup, sensor_setup
 from worlds.bag_writer import Message, Types, types_of, write_bag

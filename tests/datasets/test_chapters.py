@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vislam.core import Problems
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.messages import Frame, ImuSample
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.inspect import inspect
 from vislam.datasets.loaders import VideoLoader

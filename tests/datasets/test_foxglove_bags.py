@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from vislam.cli import run_verb
 from vislam.config import CalibrationConfig
+from vislam.core import Problems
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.stored import DamagedError

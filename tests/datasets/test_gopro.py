@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.calibration.inertial.tables import read_inertial
+from vislam.core import Problems
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame, ImuSample
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset
 from vislam.datasets.inspect import inspect
 from vislam.datasets.sensor_files import local_frame, sensor_readings

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.calibration.inertial.tables import read_inertial
+from vislam.core import Problems
 from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame, ImuSample
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.imu_pairs import paired
 from vislam.datasets.inspect import inspect

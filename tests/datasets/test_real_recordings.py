@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
+from vislam.core import Problems
 from vislam.core.messages import Frame, ImuSample
-from vislam.core.recording import Problems
 from vislam.core.streams import Happening
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.inspect import inspect

@@ -11,11 +11,11 @@ import pytest
 from test_other_formats import write_tum
 
 from vislam.config import CalibrationConfig
+from vislam.core import Problems
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Frame
-from vislam.core.recording import Problems
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.calibration import DepthFile, parse_depth
 from vislam.datasets.images import DepthFormat

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vislam.core import Problems
 from vislam.core.errors import DataError
-from vislam.core.recording import Problems
 from vislam.datasets.tables import (
     MAX_LINE_BYTES,
     in_time_order,

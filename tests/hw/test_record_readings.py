@@ -18,9 +18,9 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import BridgeClockConfig, RecordConfig, SensorsConfig, SerialConfig
+from vislam.core import Problems
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.readings import Reading
-from vislam.core.recording import Problems
 from vislam.datasets.sensor_files import sensor_readings
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.live.port_readings import PortReadings

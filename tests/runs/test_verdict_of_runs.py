@@ -114,7 +114,7 @@ def test_a_hole_is_a_doubt_of_the_imu_and_a_cause_of_the_camera():
 
 def test_dark_images_are_not_those_of_a_stuck_driver():
     def evidence(*events):
-        return evidence_of({"camera feed": {"frames": 100, "repeated": 14}}, events)
+        return evidence_of({"camera feed": {"frames": 100, "frozen": 14}}, events)
 
     dark = StreamEvent("cam0", Happening.DARK, 6_000_000_000, 8_000_000_000, 11)
     equal = StreamEvent("cam0", Happening.REPEATED, 6_200_000_000, 8_000_000_000, 10)

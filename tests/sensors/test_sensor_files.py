@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vislam.core import Problems
 from vislam.core.errors import DataError, VislamError
 from vislam.core.readings import Reading
-from vislam.core.recording import Problems
 from vislam.datasets.sensor_files import local_frame, sensor_readings
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic, LocalFrame

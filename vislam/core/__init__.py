@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         VoMeasurement,
     )
     from vislam.core.readings import Reading
+    from vislam.core.recording import Problems
 
 __all__ = [
     "Array",
@@ -53,6 +54,7 @@ __all__ = [
     "MagSample",
     "NavState",
     "Observations",
+    "Problems",
     "Reading",
     "Rig",
     "StageClock",
@@ -79,6 +81,7 @@ __getattr__ = late(
         "Observations Tracking VoMeasurement": "vislam.core.messages",
         "Camera Rig": "vislam.core.camera",
         "DataError UsageError VislamError": "vislam.core.errors",
+        "Problems": "vislam.core.recording",
         "Reading": "vislam.core.readings",
         "StageClock": "vislam.core.clock",
         "align_points invert level_rotation se3_exp se3_log sim3_parts so3_exp so3_log": "vislam.core.geometry",

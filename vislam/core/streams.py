@@ -44,7 +44,7 @@ class Happening(StrEnum):
     done: str
 
     STUCK = "stuck", "stuck at one value", "taken for missing"
-    REPEATED = "repeated", "images that equal the one before", "used as they are"
+    REPEATED = "repeated", "images that equal the one before", "used once or twice, then taken for dark"
     DUPLICATE = "duplicate", "rows of a time that was there already", "left out"
     LATE = "late", "rows behind newer ones", "left out"
     STEP_BACK = (

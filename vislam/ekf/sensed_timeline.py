@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.core.messages import Array
+from vislam.core.messages import Array, NoiseScale
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.filter_core import S
-from vislam.ekf.history import Event, M
+from vislam.ekf.history import Event, KnownBias, M
 from vislam.ekf.sensor_rows import body_of
 from vislam.ekf.timeline import Timeline, UpdateResult
 from vislam.sensors import BodyState
@@ -18,6 +18,30 @@ class SensedTimeline(Timeline[S, M]):
 
     As every measurement they may come late and in any order, those with one stamp included.
     """
+
+    def follow_noise(self, t_ns: int, scale: NoiseScale) -> UpdateResult:
+        """Assume white noise of `scale` times the model's from `t_ns` on: a ride shakes, a rest not."""
+        if not (np.isfinite(scale).all() and min(scale) > 0.0):
+            return self._refuse("noise_invalid", "factors on noise must be finite and positive")
+        return self._insert(Event(t_ns, scale))
+
+    def feed_back(
+        self,
+        gyro_bias: Array,
+        accel_bias: Array,
+        gyro_sigma: float | Array,
+        accel_sigma: float | Array,
+    ) -> UpdateResult:
+        """Take biases [3] (rad/s, m/s^2) that the graph found, as soft measurements at the present time.
+
+        Only the biases move: pose and velocity stay, now and when late measurements are replayed. The graph has used
+        the same images, so give sigmas well above its own.
+        """
+        sigmas = np.broadcast_to(gyro_sigma, 3), np.broadcast_to(accel_sigma, 3)
+        bias = np.concatenate([gyro_bias, accel_bias, *sigmas]).astype(np.float64)
+        if not (np.isfinite(bias).all() and (bias[6:] > 0.0).all()):
+            return self._refuse("bias_invalid", "biases must be finite and their sigmas positive")
+        return self._insert(Event(self._t_ns, KnownBias(bias)))
 
     def begin_sensor(self, t_ns: int, start: OwnStart) -> UpdateResult:
         """Set a sensor's own variables at a time; its readings from then on are used.

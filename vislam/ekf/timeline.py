@@ -15,16 +15,16 @@ import numpy as np
 
 from vislam.config import MachineConfig
 from vislam.core.geometry import interpolate
-from vislam.core.messages import Array, ImuSample, NavState, NoiseScale
+from vislam.core.messages import Array, ImuSample, NavState
 from vislam.ekf.filter_core import Core, S
-from vislam.ekf.history import Checkpoint, Event, History, KnownBias, M, Outcome, Statistics, add_all
+from vislam.ekf.history import Checkpoint, Event, History, M, Outcome, Statistics, add_all
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.stretch import keep_track, stretch
 from vislam.imu import ImuSeries
 
 _CHECKPOINT_S = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
 _NS = 1_000_000_000
-_HABIT_S = 0.5  # in which an acceleration that nothing measures fades away
+_HABIT_NS = _NS // 2  # in which an acceleration that nothing measures fades away
 _WAITS = "waits for an inertial sample as new"
 
 
@@ -53,7 +53,7 @@ class Timeline(Generic[S, M]):
         self._series = ImuSeries(10, machine.max_gap_s)  # beside each sample, x[:10] as of the last run through it
         self._history: History[S, M] | None = None
         self._t_ns = 0
-        self._known_ns: int | None = None  # of the last sample, where later ones are assumed
+        self._known_ns: int | None = None  # of the newest sample that came; later ones are assumed
         self._applied = 0
         self._stops_at_event = False  # see `replayed_once`
         self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *core.counters), 0)
@@ -91,14 +91,14 @@ class Timeline(Generic[S, M]):
         Samples that are no measurement of a new time, see `StreamJudge`, are counted and change nothing. What was
         assumed before it, see `assume`, is taken back.
         """
-        before, history = self._newest_known_ns, self._history
-        oldest = None if self._known_ns is None or history is None else history.checkpoints[0].t_ns
-        kept_ns = None if oldest is None else max(oldest, self._known_ns or oldest)
+        before, history, kept_ns = self._known_ns, self._history, None
+        if history is not None and before is not None and before != self._series.newest_t_ns:
+            kept_ns = max(before, history.checkpoints[0].t_ns)
         if not self._series.append(sample, kept_ns):
             return
+        self._known_ns = sample.t_ns
         self._counts["imu_samples"] += 1
         if kept_ns is not None and history is not None:
-            self._known_ns = None
             self._restore(history.back_to(kept_ns))
         dt_ns = 0 if before is None else sample.t_ns - before
         if dt_ns > self._max_gap_ns:
@@ -122,23 +122,19 @@ class Timeline(Generic[S, M]):
 
         When samples come again they say what happened meanwhile, as far back as the history reaches.
         """
-        known_ns, history = self._newest_known_ns, self._history
-        if known_ns is None or history is None:
+        history = self._history
+        if self._known_ns is None or history is None:
             return
         number = self._applied
         while (event := history.event(number)) is not None and event.t_ns <= t_ns:
             t_ns, number = max(t_ns, self._core.time_of(event, self._state)), number + 1
         if t_ns > (self._series.newest_t_ns or t_ns):
-            self._known_ns = known_ns
-            self._series.assume(t_ns, self._fading(t_ns))
+            uniform, share = (
+                _in_uniform_motion(self._state.x, self._gravity_m_s2),
+                np.exp((self._t_ns - t_ns) / _HABIT_NS),
+            )
+            self._series.assume(t_ns, uniform + share * (self._series.values[-1] - uniform))
             self._run()
-
-    def _fading(self, t_ns: int) -> Array:
-        """Return the sample [6] of a motion that fades into a uniform one: nobody turns or speeds up for long."""
-        x, share = self._state.x, float(np.exp((self._t_ns - t_ns) / _NS / _HABIT_S))
-        force = pose(x, 0, 6)[2, :3] * self._gravity_m_s2 + x[10:13]
-        uniform = np.concatenate([x[13:16], force])
-        return uniform + share * (self._series.values[-1] - uniform)
 
     @contextmanager
     def replayed_once(self) -> Iterator[None]:
@@ -149,30 +145,6 @@ class Timeline(Generic[S, M]):
         finally:
             self._stops_at_event = False
             self._run()
-
-    def follow_noise(self, t_ns: int, scale: NoiseScale) -> UpdateResult:
-        """Assume white noise of `scale` times the model's from `t_ns` on: a ride shakes, a rest not."""
-        if not (np.isfinite(scale).all() and min(scale) > 0.0):
-            return self._refuse("noise_invalid", "factors on noise must be finite and positive")
-        return self._insert(Event(t_ns, scale))
-
-    def feed_back(
-        self,
-        gyro_bias: Array,
-        accel_bias: Array,
-        gyro_sigma: float | Array,
-        accel_sigma: float | Array,
-    ) -> UpdateResult:
-        """Take biases [3] (rad/s, m/s^2) that the graph found, as soft measurements at the present time.
-
-        Only the biases move: pose and velocity stay, now and when late measurements are replayed. The graph has used
-        the same images, so give sigmas well above its own.
-        """
-        sigmas = np.broadcast_to(gyro_sigma, 3), np.broadcast_to(accel_sigma, 3)
-        bias = np.concatenate([gyro_bias, accel_bias, *sigmas]).astype(np.float64)
-        if not (np.isfinite(bias).all() and (bias[6:] > 0.0).all()):
-            return self._refuse("bias_invalid", "biases must be finite and their sigmas positive")
-        return self._insert(Event(self._t_ns, KnownBias(bias)))
 
     def state(self) -> NavState:
         """Return the state at the newest sample. Raises ValueError before `initialise`."""
@@ -235,10 +207,6 @@ class Timeline(Generic[S, M]):
         if outcome is None:
             return UpdateResult(False, float("nan"), _WAITS)
         return UpdateResult(outcome.accepted, outcome.nis, outcome.reason)
-
-    @property
-    def _newest_known_ns(self) -> int | None:
-        return self._series.newest_t_ns if self._known_ns is None else self._known_ns
 
     def _run(self, until_ns: int | None = None) -> None:
         """Go on from the present state through every sample and event that is here, or until a time."""
@@ -319,3 +287,8 @@ class Timeline(Generic[S, M]):
     def _nav_state(self, t_ns: int, state: S) -> NavState:
         x, covariance = state.x, self._core.covariance(state)
         return NavState(t_ns, pose(x, 0, 6), x[3:6].copy(), x[13:16].copy(), x[10:13].copy(), covariance)
+
+
+def _in_uniform_motion(x: Array, gravity_m_s2: float) -> Array:
+    """Return what an IMU shows [6] of a body that neither turns nor speeds up, in a state x."""
+    return np.concatenate([x[13:16], pose(x, 0, 6)[2, :3] * gravity_m_s2 + x[10:13]])

@@ -15,6 +15,8 @@ from vislam.core.streams import Happening, StreamJudge
 _DESCRIPTOR_BYTES = 32
 _EVERY_PX = 8  # the image is compared with the one before at one pixel in so many, each way
 _HOLE_S = 0.25  # without a frame, at least
+_STUCK_ROWS = 2  # images equal to the one before, from which on they show nothing: one may be a hiccup
+_ALIVE = 0.5  # of the pixels that change from frame to frame, by noise or motion: equal images then are no rest
 
 
 class Intake:
@@ -89,18 +91,25 @@ class CameraFeed:
         frames: so far.
         missing: frames that an even rate would have brought.
         repeated: images equal to the one before to the last bit while the body moved, which noise makes impossible.
+        frozen: those of them that were several in a row.
         judge: of their times, and of what happened to images.
         first_t_ns: of the first one; None before it.
     """
 
     def __init__(self) -> None:
         """Start empty."""
-        self.frames = self.missing = self.repeated = 0
+        self.frames = self.missing = self.repeated = self.frozen = 0
         self.judge = StreamJudge("cam0", hole_s=_HOLE_S)
         self.first_t_ns: int | None = None
         self._last: ImageU8 | None = None
         self._last_t_ns: int | None = None
-        self._is_same = False
+        self._same = 0  # images in a row that equal the one before
+        self._changed = 0.0  # share of the pixels, in the newest that did not
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether the newest image is one of long ago again, and shows nothing of its own time."""
+        return self._same >= _STUCK_ROWS and self._changed > _ALIVE
 
     def add(self, frame: Frame) -> None:
         """Take a frame as the camera gave it; `moved` has to follow."""
@@ -112,13 +121,16 @@ class CameraFeed:
             self.missing += max(round((frame.t_ns - self._last_t_ns) / usual_ns) - 1, 0)
         self._last_t_ns = frame.t_ns
         small = frame.images[0][::_EVERY_PX, ::_EVERY_PX].copy() if frame.images else None
-        self._is_same = small is not None and self._last is not None and np.array_equal(small, self._last)
+        comparable = small is not None and self._last is not None and small.shape == self._last.shape
+        changed = float(np.mean(small != self._last)) if comparable else 1.0
+        self._same, self._changed = (self._same + 1, self._changed) if changed == 0.0 else (0, changed)
         if frame.images:
             self.judge.look(frame.images[0], frame.t_ns, frame.t_ns)
         self._last = small
 
     def moved(self, at_rest: bool) -> None:
         """Say whether the body rested over the newest frame."""
-        if self._is_same and not at_rest and self._last_t_ns is not None:
+        if self._same and not at_rest and self._last_t_ns is not None:
             self.repeated += 1
+            self.frozen += self.is_frozen
             self.judge.note(Happening.REPEATED, self._last_t_ns, self._last_t_ns)

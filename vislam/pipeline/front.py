@@ -150,8 +150,7 @@ class Front:
 
     def process(self, frame: Frame) -> FrontStep:
         """Track one frame, correct the filter with it, and hand over keyframes that are ready."""
-        self.watch.feed.add(frame)
-        frame = self.camera_clock.in_imu_time(frame)
+        frame = self.camera_clock.in_imu_time(self.watch.see(frame))
         imu = self._imu
         if torn(frame, self._chain, self.frontend, imu):
             self._last_frame_t_ns = None

@@ -13,7 +13,7 @@ from vislam.config import EkfConfig, InitConfig
 from vislam.core.geometry import so3_exp
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import StartFacts
-from vislam.core.messages import Array, ImuSpan, NavState, Tracking
+from vislam.core.messages import Array, Frame, ImuSpan, NavState, Tracking
 from vislam.core.streams import StreamEvent
 from vislam.frontend import TrackResult, knows_scale
 from vislam.frontend.camera_clock import CameraClock
@@ -21,6 +21,7 @@ from vislam.frontend.intake import CameraFeed
 from vislam.frontend.pixel_noise import NoiseUsed
 from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.imu import InertialCondition, NoiseRatios
+from vislam.pipeline.dark import dark
 from vislam.pipeline.gravity import Phase
 from vislam.trajectory import Alignment, gauge_alignment
 
@@ -135,6 +136,11 @@ class RunWatch:
         self._lost_since_ns: int | None = None
         self._why_lost = Counter[str]()
 
+    def see(self, frame: Frame) -> Frame:
+        """Take a frame as the camera gave it; return it as it can be used: one that is frozen shows nothing."""
+        self.feed.add(frame)
+        return replace(dark(frame, frame.t_ns), follows_step=frame.follows_step) if self.feed.is_frozen else frame
+
     def note(self, track: TrackResult, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
         """Take what became of the frame that `feed` has.
 
@@ -174,7 +180,12 @@ class RunWatch:
             front["frames_without_excitation"] = self.uniform.frames
         return {
             "front": front,
-            "camera feed": {"frames": feed.frames, "missing": feed.missing, "repeated": feed.repeated},
+            "camera feed": {
+                "frames": feed.frames,
+                "missing": feed.missing,
+                "repeated": feed.repeated,
+                "frozen": feed.frozen,
+            },
         }
 
 

@@ -44,7 +44,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         frames_degraded=front.get("frames_degraded", 0),
         frames_by_depth=front.get("frames_by_depth", 0),
         frames_missing=feed.get("missing", 0),
-        frames_repeated=feed.get("repeated", 0) - _equal_in_the_dark(report.events),
+        frames_repeated=max(feed.get("frozen", 0) - _equal_in_the_dark(report.events), 0),
         dark_s=max((_lasted_s(e) for e in report.events if e.happening is Happening.DARK), default=0.0),
         frames_offered=live.get("frames_offered", 0),
         frames_dropped=live.get("frames_dropped", 0),

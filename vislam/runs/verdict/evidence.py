@@ -54,7 +54,7 @@ class Evidence:
     frames_degraded: int = 0
     frames_by_depth: int = 0  # of those: placed by depth alone
     frames_missing: int = 0  # that an even rate would have brought
-    frames_repeated: int = 0  # equal to the one before in motion, though not dark
+    frames_repeated: int = 0  # equal to the one before in motion, several in a row, though not dark
     dark_s: float = 0.0  # longest time in which images showed nothing
     coverage: float = 1.0  # share of the frames that have a pose
     submaps_apart: int = 0  # submaps that no loop has joined with the first

@@ -224,7 +224,7 @@ BREAKS: Mapping[str, Fault] = {
     "disordered": Fault("one inertial row in fifty is late", _IMU, imu.DISORDERED, _ON, ("imu0 late",), _ANY),
     "no number": Fault("inertial rows are NaN", _IMU, imu.NO_NUMBER, _LONG, ("imu0 unusable",), _ANY),
     "bursts": Fault("inertial rows come in bursts, stamped then", _IMU, imu.BURSTS, _ON, ("imu0 burst",), _SCALE),
-    "coarse": Fault("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, ("imu0 sawtooth",), _SCALE),
+    "coarse": Fault("inertial stamps are rounded to 10 ms", _IMU, imu.COARSE, _ON, ("imu0 duplicate",), _SCALE),
     "halved": Fault("every other inertial sample is missing", _IMU, imu.thinned(2), _ON, ("imu0 wrong rate",), _ANY),
     "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, ("imu0 clipped",), _SCALE),
     "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY, _ON),
