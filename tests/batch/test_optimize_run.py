@@ -8,7 +8,7 @@ import pytest
 from vislam.batch import optimize_run
 from vislam.config import BatchConfig, Config
 from vislam.core.errors import DataError
-from vislam.core.geometry import invert, so3_log
+from vislam.core.geometry import invert, so3_exp, so3_log, transform
 from vislam.core.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
 from vislam.trajectory.frames import LoggedFrames
 from worlds.lap import position, rotation
@@ -207,6 +207,15 @@ def test_frames_between_keyframes_follow_the_imu():
     assert interpolated[0] > 5 * with_imu[0]
     holed = changed(log, {10}, lambda packet: replace(packet, imu=_without_middle(packet.imu)))
     assert with_imu[0] < worst(holed)[0] < 1.5 * interpolated[0]
+    rng = np.random.default_rng(5)
+    between = (t_ns % 250_000_000 != 0) & (t_ns < states[-1].t_ns)
+    turns = [so3_exp(0.01 * noisy * rng.standard_normal(3)) for noisy in between]
+    poses = zip(frames.keyframe_ids.tolist(), R, p, turns, strict=True)
+    seen = [invert(run.truth[k]) @ transform(turned @ turn, at) for k, turned, at, turn in poses]
+    frames = replace(frames, T_keyframe_body=seen)
+    by_vision = worst(log)
+    print("orientation by the gyroscope, places by vision", by_vision)
+    assert by_vision[0] < 1e-9 and by_vision[1] < 0.02 * 0.03  # of the scatter of vision
 
 
 def _without_middle(span):

@@ -1,11 +1,15 @@
 """What camera and IMU deliver, told from samples and frames alone: holes, rates, ranges that end, stuck images."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from vislam.core.messages import Frame, ImuSample
+from vislam.core import Frame, ImuSample, Problems
+from vislam.core.streams import StreamJudge
 from vislam.frontend.intake import CameraFeed
 from vislam.imu import ConditionWatch
+from vislam.runs.run_input import RunInput
 
 _NS = 1_000_000_000
 
@@ -91,3 +95,36 @@ def test_images_that_repeat_while_the_body_moves_are_counted():
     assert feed([(k * 50_000_000, im) for k, im in enumerate(stuck)]).repeated == 20
     assert feed([(k * 50_000_000, im) for k, im in enumerate(stuck)], at_rest=True).repeated == 0
     assert feed([(k * 50_000_000, im) for k, im in enumerate(seen)]).repeated == 0
+
+
+def test_images_that_are_stuck_are_told_from_hiccups_and_from_rest():
+    seen = images(6)
+    stamped = [(k * 50_000_000, im) for k, im in enumerate([*seen, seen[5], seen[5]])]
+    assert not feed(stamped[:-1]).is_frozen
+    assert feed(stamped).is_frozen and feed(stamped).frozen == 1
+    drawn = [seen[0].copy() for _ in range(5)]  # without noise, before a body that stops: few pixels change
+    for k, image in enumerate(drawn[:3]):
+        image[8 * k] += 1
+    assert not feed([(k * 50_000_000, im) for k, im in enumerate([*drawn, drawn[4]])]).is_frozen
+
+
+@pytest.mark.parametrize(
+    ("stepping", "kept_s"), [({"imu0"}, 5.0), ({"cam0"}, 5.5), ({"imu0", "cam0"}, 10.0), ((), 10.0)]
+)
+def test_inertial_data_end_where_one_clock_steps_alone(stepping, kept_s, tmp_path):
+    """At 5 s; what is behind the newest row is left out by the reader, which has judged it."""
+    problems = Problems()
+    problems.judges = {name: StreamJudge(name) for name in ("imu0", "cam0")}
+    streams = {"imu0": [k * _NS // 100 for k in range(1000)], "cam0": [k * _NS // 20 for k in range(200)]}
+    values = []
+    for name, stamps in streams.items():
+        late_ns = [t - _NS if name in stepping and t > 5 * _NS else t for t in stamps]
+        kept = [t for t in late_ns if problems.judges[name].takes(t)]
+        values += [ImuSample(t, np.zeros(3), np.zeros(3)) if name == "imu0" else Frame(t, 0, ()) for t in kept]
+    values.sort(key=lambda value: value.t_ns)
+    recording = SimpleNamespace(events=lambda from_ns=None: iter(values), name="a cart", problems=problems)
+    run = RunInput(recording, None, tmp_path)
+    samples = [value.t_ns for value in run.values(None) if isinstance(value, ImuSample)]
+    newest = max(t for t in samples)
+    assert newest * 1e-9 == pytest.approx(min(kept_s, values[-1].t_ns * 1e-9), abs=0.06)
+    assert len(run.problems) == (len(stepping) == 1)

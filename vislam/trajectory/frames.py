@@ -57,13 +57,14 @@ class LoggedFrames:
             spans: inertial data between keyframe id - 1 and id, where there are any.
             gravity_m_s2: down in the frame of the states.
             max_gap_s: spans with a longer hole are not used; their frames stay as they are.
-            measured_too: also for frames whose motion vision has measured.
+            measured_too: also for frames whose motion vision has measured; else they get the orientation alone, for
+                the gyroscope is steadier from frame to frame.
         """
         motions, ids = list(self.T_keyframe_body), self.keyframe_ids.copy()
         for k, (before, after) in enumerate(pairwise(states)):
             span = spans.get(k + 1)
             inside = np.flatnonzero((self.t_ns > before.t_ns) & (self.t_ns < after.t_ns)).tolist()
-            wanted = [i for i in inside if measured_too or motions[i] is None]
+            wanted = [i for i in inside if measured_too or motions[i] is None or ids[i] == k]
             if span is None or not wanted or not _covers(span, before.t_ns, after.t_ns, max_gap_s):
                 continue
             if not np.all(np.isfinite(np.concatenate([before.velocity_world_m_s, before.gyro_bias_rad_s]))):
@@ -73,8 +74,11 @@ class LoggedFrames:
             for i in wanted:
                 t_ns = int(self.t_ns[i])
                 share = (t_ns - before.t_ns) / (after.t_ns - before.t_ns)
-                motions[i] = T_inverse @ _carried(before, span, t_ns, gravity_m_s2) @ se3_exp(share * miss)
-                ids[i] = k
+                carried = T_inverse @ _carried(before, span, t_ns, gravity_m_s2) @ se3_exp(share * miss)
+                seen = motions[i]
+                if seen is not None and not measured_too:
+                    carried[:3, 3] = seen[:3, 3]
+                motions[i], ids[i] = carried, k
         return replace(self, T_keyframe_body=motions, keyframe_ids=ids)
 
 
