@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
-from vislam.core.messages import Frame, ImageU8, Observations
+from vislam.core.messages import Frame, ImageF32, ImageU8, Observations
 from vislam.core.streams import Happening, StreamJudge
 
 _DESCRIPTOR_BYTES = 32
@@ -102,14 +102,16 @@ class CameraFeed:
         self.judge = StreamJudge("cam0", hole_s=_HOLE_S)
         self.first_t_ns: int | None = None
         self._last: ImageU8 | None = None
+        self._last_depth_m: ImageF32 | None = None
+        self._has_new_depth = False  # other than that of the frame before
         self._last_t_ns: int | None = None
         self._same = 0  # images in a row that equal the one before
         self._changed = 0.0  # share of the pixels, in the newest that did not
 
     @property
     def is_frozen(self) -> bool:
-        """Whether the newest image is one of long ago again, and shows nothing of its own time."""
-        return self._same >= _STUCK_ROWS and self._changed > _ALIVE
+        """Whether the newest frame is one of long ago again, and shows nothing of its own time."""
+        return self._same >= _STUCK_ROWS and self._changed > _ALIVE and not self._has_new_depth
 
     def add(self, frame: Frame) -> None:
         """Take a frame as the camera gave it; `moved` has to follow."""
@@ -121,12 +123,17 @@ class CameraFeed:
             self.missing += max(round((frame.t_ns - self._last_t_ns) / usual_ns) - 1, 0)
         self._last_t_ns = frame.t_ns
         small = frame.images[0][::_EVERY_PX, ::_EVERY_PX].copy() if frame.images else None
-        comparable = small is not None and self._last is not None and small.shape == self._last.shape
-        changed = float(np.mean(small != self._last)) if comparable else 1.0
-        self._same, self._changed = (self._same + 1, self._changed) if changed == 0.0 else (0, changed)
+        depth_m = None if frame.depth_m is None else frame.depth_m[::_EVERY_PX, ::_EVERY_PX].copy()
+        if small is not None and self._last is not None and small.shape == self._last.shape:
+            changed = float(np.mean(small != self._last))
+            self._same, self._changed = (0, changed) if changed else (self._same + 1, self._changed)
+        before = self._last_depth_m
+        self._has_new_depth = (
+            depth_m is not None and before is not None and not np.array_equal(depth_m, before, equal_nan=True)
+        )
         if frame.images:
             self.judge.look(frame.images[0], frame.t_ns, frame.t_ns)
-        self._last = small
+        self._last, self._last_depth_m = small, depth_m
 
     def moved(self, at_rest: bool) -> None:
         """Say whether the body rested over the newest frame."""
