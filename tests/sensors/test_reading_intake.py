@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +22,7 @@ from worlds.parts import GRAVITY_M_S2, bare_keyframe, derivative, ideal_imu
 
 MS = 10**6
 NEEDED = 3  # readings that `Offset` begins with
-SPOILT = -1.0  # a value at which `Fragile` fails
+SPOILT, ENDED = -1.0, -2.0  # values at which `Fragile` fails, and ends the program
 
 
 class Plain(Sensor):
@@ -58,7 +59,21 @@ class Fragile(Plain):
     def check(self, values):
         if values[0] == SPOILT:
             raise KeyError("nobody thought of that")
+        if values[0] == ENDED:
+            sys.exit(3)
         return ""
+
+
+class Derived(Plain):
+    """Gives its own derivative, `factor` times what it is."""
+
+    def __init__(self, factor: float) -> None:
+        self._factor = factor
+
+    def jacobians(self, values, body, own):
+        H = np.zeros((1, 15))
+        H[0, 3] = self._factor
+        return H, np.zeros((1, 0))
 
 
 class Broken(Offset):
@@ -177,9 +192,10 @@ def test_a_check_that_raises_costs_that_reading_only():
     intake = intake_of({"fragile": Fragile(), "plain": Plain()}, filtering)
     for one in (reading("fragile", 10, SPOILT), reading("fragile", 20), reading("plain", 20)):
         intake.add(one)
+    intake.add(reading("fragile", 30, ENDED))
     intake.hand_on(60 * MS)
     assert [what.sensor for _, what in filtering.told] == ["fragile", "plain"]
-    assert intake.counters["fragile"]["unusable"] == 1
+    assert intake.counters["fragile"]["unusable"] == 2
     assert "KeyError" in intake.notes["fragile"]
     assert "plain" not in intake.notes
 
@@ -209,6 +225,19 @@ def test_a_sensor_that_cannot_begin_is_left_out_alone_and_named(begun, why):
     assert not report["broken"]["begun"]
     assert intake.counters["broken"]["unusable"] == 3  # all but the one with which it failed
     assert "note" not in report["plain"]
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.05, -1.0, 0.0, 2.0])
+def test_a_sensor_whose_jacobians_are_wrong_is_left_out_and_named(factor):
+    filtering = FakeFiltering()
+    intake = intake_of({"derived": Derived(factor)}, filtering)
+    for k in range(10):
+        intake.add(reading("derived", 10 * k))
+    intake.hand_on(100 * MS)
+    is_right = abs(factor - 1.0) < 0.1
+    assert len(filtering.told) == (10 if is_right else 0)
+    assert intake.counters["derived"]["unusable"] == (0 if is_right else 10)
+    assert ("not those of its residual: position" in intake.report()["derived"].get("note", "")) != is_right
 
 
 def test_queues_are_bounded_and_what_leaves_them_is_counted(monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -115,6 +117,7 @@ def longer_ahead(values: Array, body: BodyState, own: Array) -> Array:
         (longer_ahead, "shape"),
         (lambda values, body, own: np.full(1, np.nan), "not finite"),
         (lambda values, body, own: 1 / 0, "ZeroDivisionError"),
+        (lambda values, body, own: sys.exit(1), "SystemExit"),
     ],
 )
 def test_what_a_sensor_does_wrong_is_told_by_its_name(wrong, message: str) -> None:

@@ -14,7 +14,7 @@ from vislam.core.readings import OwnStart, Reading
 from vislam.ekf.history import Outcome
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.regain import Refused, Regain, Watch
-from vislam.sensors import BodyState, SensorError, Suite, linearised
+from vislam.sensors import USER_ERRORS, BodyState, SensorError, Suite, linearised
 
 _ENDS = (
     "accepted",
@@ -68,7 +68,7 @@ class Sensing:
         """Return why a reading cannot be used; empty: it can."""
         try:
             return self.suite.why_unusable(reading)
-        except Exception as error:  # the code is a user's
+        except USER_ERRORS as error:
             return f"the check of sensor {reading.sensor!r}: {type(error).__name__}: {error}"
 
     def why_no_start(self, start: OwnStart) -> str:

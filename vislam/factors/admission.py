@@ -10,7 +10,7 @@ import numpy as np
 from vislam.core.readings import Motion, MotionReadings, PlacedReading
 from vislam.factors.reading_counts import ReadingCounts
 from vislam.factors.reading_factor import as_motion
-from vislam.sensors import Suite
+from vislam.sensors import USER_ERRORS, Suite
 
 MOST = 10  # readings of one sensor between two keyframes; of more, as many evenly spaced
 
@@ -30,7 +30,7 @@ class Admission:
             return False
         try:
             why = self._suite.why_unusable(placed.reading)
-        except Exception as error:  # its check is somebody else's code
+        except USER_ERRORS as error:
             why = str(error) or type(error).__name__
         if why:
             self._counts.add(placed.reading.sensor, "unusable")

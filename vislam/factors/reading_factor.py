@@ -16,7 +16,7 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
 from vislam.core.readings import Motion, OwnNow, PlacedReading
 from vislam.factors.noise_models import conditioned
-from vislam.sensors import Sensor, SensorError, linearised
+from vislam.sensors import USER_ERRORS, Sensor, SensorError, linearised
 from vislam.sensors.body import between_keyframes, by_keyframes, path_variances, rate_by_keyframes
 from vislam.sensors.linear import Linear
 
@@ -156,7 +156,7 @@ class ReadingFactor:
             body = between_keyframes(*poses, reading.t_ns, station)
             try:
                 residual = row.whitening @ np.asarray(self._sensor.residual(reading.values, body, own), np.float64)
-            except Exception:  # it is somebody else's code
+            except USER_ERRORS:
                 residual = np.full(1, np.nan)
             if residual.shape != (len(row.whitening),) or not np.isfinite(residual).all():
                 self._failed(row.number)

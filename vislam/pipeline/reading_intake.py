@@ -16,7 +16,7 @@ from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, ImuNoise, preintegrate
 from vislam.pipeline.inertial_stages import Inertial
 from vislam.pipeline.slip_watch import SlipWatch
-from vislam.sensors import BodyState, Sensor, Suite
+from vislam.sensors import USER_ERRORS, BodyState, Sensor, SensorError, Suite, wrong_jacobians
 from vislam.sensors.body import between_keyframes
 
 _MAX_WAITING = 4096  # readings that wait for the filter to begin; older ones go
@@ -24,6 +24,7 @@ _MAX_SINCE = 16384  # readings that wait for a keyframe; older ones go
 _MAX_TRIED = 1024  # readings that a sensor begins with; of more every other one is kept
 _MORE = 1.2  # so many times the readings of the last attempt before the next
 _FREE_FORCE_M_S2 = 1.0  # what a body does between keyframes of which no IMU tells
+_PROOFS = 5  # readings of each sensor by which its own Jacobians are compared with its residual
 _MIN_PATH_NS = 1_000  # a span of less is no span, and gains no speed that shows
 
 
@@ -81,6 +82,7 @@ class ReadingIntake:
         self._since: deque[Reading] = deque()  # the newest keyframe
         self._slips = {name: SlipWatch() for name in suite.names if suite[name].slips}
         self._left_out: set[str] = set()  # sensors whose code failed
+        self._unproven = dict.fromkeys(suite.names, _PROOFS)  # readings that their Jacobians are still tried with
         self._path: deque[tuple[int, Array]] = deque(maxlen=2)  # times and poses of frames, where there is no filter
 
     @classmethod
@@ -152,7 +154,7 @@ class ReadingIntake:
             reading = self._waiting.popleft()
             if reading.t_ns > newest_t_ns:
                 self._waiting.append(reading)
-            elif reading.sensor in self._left_out:
+            elif reading.sensor in self._left_out or self._is_found_wrong(reading):
                 self.counters[reading.sensor]["unusable"] += 1
             elif reading.sensor in self._beginning:
                 self._compare(reading)
@@ -166,7 +168,9 @@ class ReadingIntake:
         """
         t_ns = packet.keyframe.t_ns
         placed, later = [], deque[Reading]()
-        path = self._path_between(before_t_ns, t_ns, state) if self._since else None
+        path = None
+        if self._since:
+            path = _path_between(before_t_ns, t_ns, self._buffer, state, self._gravity, self._accel_density)
         for reading in self._since:
             if reading.t_ns > t_ns:
                 later.append(reading)
@@ -216,13 +220,28 @@ class ReadingIntake:
             return "its sensor is left out"
         try:
             return self._suite.why_unusable(reading)
-        except Exception as error:
+        except USER_ERRORS as error:
             return f"its check failed: {_told(error)}"
 
     def _queue(self, queue: deque[Reading], reading: Reading, most: int, left_as: str) -> None:
         queue.append(reading)
         if len(queue) > most:
             self.counters[queue.popleft().sensor][left_as] += 1
+
+    def _is_found_wrong(self, reading: Reading) -> bool:
+        """Whether a sensor's own Jacobians are wrong, as one of its first readings shows; then it is left out."""
+        name, body = reading.sensor, self._body_at(reading.t_ns) if self._unproven[reading.sensor] else None
+        if body is None:
+            return False
+        self._unproven[name] -= 1
+        try:
+            why = wrong_jacobians(self._suite[name], reading, body, self._suite.starts[self._suite.own(name)])
+        except SensorError:  # the estimators count that, reading by reading
+            return False
+        if why:
+            self.notes[name] = f"left out: {why}"
+            self._left_out.add(name)
+        return bool(why)
 
     def _compare(self, reading: Reading) -> None:
         """Compare a reading with the path, and begin the sensor once that tells its own variables."""
@@ -254,7 +273,7 @@ class ReadingIntake:
         """Return first values of a sensor's own variables; None: too early, or the sensor is left out from here on."""
         try:
             return _first_values(name, self._suite[name], beginning)
-        except Exception as error:
+        except USER_ERRORS as error:
             self.notes[name] = f"left out, it cannot begin: {_told(error)}"
             self._left_out.add(name)
             beginning.readings.clear()
@@ -269,18 +288,6 @@ class ReadingIntake:
         (t0_ns, T0), (t1_ns, T1) = self._path
         station = _freely((t_ns - t0_ns) * 1e-9, (t1_ns - t0_ns) * 1e-9)
         return between_keyframes(T0, T1, t_ns, station)
-
-    def _path_between(self, t0_ns: int, t1_ns: int, state: NavState | None) -> Callable[[int], Station | None] | None:
-        """Return what gives the station of a time between two keyframes; None where inertial data do not cover them."""
-        length_s = (t1_ns - t0_ns) * 1e-9
-        if self._buffer is None:
-            return lambda t_ns: _freely((t_ns - t0_ns) * 1e-9, length_s)
-        whole = None if state is None else self._buffer.span(t0_ns, t1_ns)
-        if state is None or whole is None:
-            return None
-        white = self._accel_density * whole.noise.accel
-        force_variance = float(np.diag(state.covariance)[12:15].max()) + white**2 / length_s
-        return _InertialPath(self._buffer, whole, state, self._gravity, float(np.sqrt(force_variance))).station
 
 
 class _InertialPath:
@@ -308,6 +315,21 @@ class _InertialPath:
             since_s, length_s, dR, dv, dp, whole.dR, whole.dp_m, self._gravity, rate - gyro_bias, gyro_bias, accel_bias,
             self._sigma,
         )  # fmt: skip
+
+
+def _path_between(
+    t0_ns: int, t1_ns: int, buffer: ImuBuffer | None, state: NavState | None, gravity_m_s2: float, accel_density: float
+) -> Callable[[int], Station | None] | None:
+    """Return what gives the station of a time between two keyframes; None where inertial data do not cover them."""
+    length_s = (t1_ns - t0_ns) * 1e-9
+    if buffer is None:
+        return lambda t_ns: _freely((t_ns - t0_ns) * 1e-9, length_s)
+    whole = None if state is None else buffer.span(t0_ns, t1_ns)
+    if state is None or whole is None:
+        return None
+    white = accel_density * whole.noise.accel
+    force_variance = float(np.diag(state.covariance)[12:15].max()) + white**2 / length_s
+    return _InertialPath(buffer, whole, state, gravity_m_s2, float(np.sqrt(force_variance))).station
 
 
 def _first_values(name: str, sensor: Sensor, beginning: _Beginning) -> OwnStart | None:
@@ -349,7 +371,7 @@ def _with_motions(
     return replace(packet, readings=tuple(rest), motions=tuple(motions))
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from vislam.core.late import late
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured
-from vislam.sensors.linear import Linear, SensorError, derived, linearised
+from vislam.sensors.linear import Linear, SensorError, derived, linearised, wrong_jacobians
 from vislam.sensors.registry import kind_class, register
-from vislam.sensors.sensor import Begun, Sensor, Variable
+from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
 from vislam.sensors.suite import Suite
 from vislam.sensors.toml import SensorFile, SensorSetup, load_sensor_setup
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vislam.sensors.true_path import bodies_on
 
 __all__ = [
+    "USER_ERRORS",
     "Begun",
     "BodyState",
     "Configured",
@@ -34,6 +35,7 @@ __all__ = [
     "linearised",
     "load_sensor_setup",
     "register",
+    "wrong_jacobians",
 ]
 
 __getattr__ = late(

@@ -10,7 +10,10 @@ from vislam.core.errors import VislamError
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.body import ERRORS, NUDGE, PARTS, BodyState
-from vislam.sensors.sensor import Sensor
+from vislam.sensors.sensor import USER_ERRORS, Sensor
+
+_WRONG = 0.2  # of the larger one: a sign, a factor, a frame; less may be meant
+_ROUNDING = 1e-4  # of slopes by differences
 
 
 class SensorError(VislamError):
@@ -48,9 +51,27 @@ def linearised(sensor: Sensor, reading: Reading, body: BodyState, own: Array) ->
             raise ValueError("numbers that are not finite")
         if not (np.diag(linear.noise) > 0.0).all():
             raise ValueError("noise without a positive variance of every number")
-    except Exception as error:  # the code is a user's
+    except USER_ERRORS as error:
         raise SensorError(f"sensor {reading.sensor!r} at {reading.t_ns} ns: {type(error).__name__}: {error}") from error
     return linear
+
+
+def wrong_jacobians(sensor: Sensor, reading: Reading, body: BodyState, own: Array) -> str:
+    """Return which of a sensor's own Jacobians differ from the slopes of its residual; empty: none, or it has none.
+
+    Raises SensorError as `linearised` does.
+    """
+    linear = linearised(sensor, reading, body, own)
+    if sensor.jacobians(reading.values, body, own) is None:
+        return ""
+    H, H_own = derived(sensor, reading.values, body, own, linear.residual)
+    parts = [(part, linear.H[:, PARTS[part]], H[:, PARTS[part]]) for part in PARTS]
+    wrong = [
+        part
+        for part, given, slopes in [*parts, ("own variables", linear.H_own, H_own)]
+        if given.size and np.abs(given - slopes).max() > _WRONG * np.abs([given, slopes]).max() + _ROUNDING
+    ]
+    return f"its Jacobians are not those of its residual: {', '.join(wrong)}" if wrong else ""
 
 
 def derived(

@@ -12,6 +12,8 @@ from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.body import BodyState
 
+USER_ERRORS = (Exception, SystemExit)  # whatever a sensor's own code raises, or ends with: the run goes on
+
 
 class Variable(NamedTuple):
     """One number that is estimated beside the body: a lever arm, a scale, an offset, a coordinate of a frame."""
