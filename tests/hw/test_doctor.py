@@ -192,7 +192,7 @@ def test_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
         assert run_verb(["doctor", "--i2c", bus.path, "--seconds", "0.5", "--json"]) == 0
         answer = json.loads(capsys.readouterr().out)
         assert {d["name"] for d in answer["devices"]} >= {"ITG3205", "ADXL345"}
-        assert answer["timings"][0]["count"] > 50
+        assert answer["timings"][0]["count"] > 5  # 100 on an idle machine
         assert run_verb(["doctor", "--i2c", bus.path, "--seconds", "0.5"]) == 0
         assert "passes its self-test" in capsys.readouterr().out
     assert run_verb(["doctor", "--i2c", bus.path]) == 5
