@@ -260,6 +260,7 @@ def main() -> None:
     results = campaign.results()
     judged = Judged([judged_again(entry) for entry in results] if options.again else results)
     lines = "\n".join([*judged.by_kind(), "", *judged.summary()])
+    options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "breaks.md").write_text("\n".join([lines, "", *judged.by_run()]) + "\n", encoding="utf-8")
     print(lines)
 

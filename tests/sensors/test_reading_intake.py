@@ -240,6 +240,15 @@ def test_a_sensor_whose_jacobians_are_wrong_is_left_out_and_named(factor):
     assert ("not those of its residual: position" in intake.report()["derived"].get("note", "")) != is_right
 
 
+def test_a_residual_that_ends_the_program_beside_its_point_does_not_end_the_run(monkeypatch):
+    filtering, ends = FakeFiltering(), lambda _, values, body, own: sys.exit(3) if body.position_m.any() else values
+    monkeypatch.setattr(Derived, "residual", ends, raising=False)
+    intake = intake_of({"derived": Derived(1.0)}, filtering)
+    intake.add(reading("derived", 10))
+    intake.hand_on(100 * MS)
+    assert stamps_ms(filtering.told) == [10]
+
+
 def test_queues_are_bounded_and_what_leaves_them_is_counted(monkeypatch):
     monkeypatch.setattr(intake_module, "_MAX_WAITING", 5)
     monkeypatch.setattr(intake_module, "_MAX_SINCE", 4)

@@ -69,6 +69,7 @@ class Happening(StrEnum):
         return made
 
 
+_TEARING = (Happening.STEP_BACK, Happening.LOOPED, Happening.APPENDED)
 _OF_STAMPS = (Happening.BURST, Happening.SAWTOOTH, Happening.WRONG_RATE, Happening.APPENDED)
 
 
@@ -89,7 +90,7 @@ class StreamEvent:
     @property
     def tears(self) -> bool:
         """Whether it parts what came before from what came after by an unknown time."""
-        return self.happening in (Happening.STEP_BACK, Happening.LOOPED, Happening.APPENDED)
+        return self.happening in _TEARING
 
     def entry(self, begin_ns: int, done: str = "") -> dict[str, Any]:
         """Return it for a JSON file, in seconds since `begin_ns`; `done` is what was done, if not the usual."""
@@ -175,6 +176,13 @@ class StreamJudge:
         if (pause := self._pace.pending) is not None:
             known = known | {pause[0]: _joined(known.get(pause[0], []), StreamEvent(self.stream, *pause))}
         return sorted((e for some in known.values() for e in some), key=lambda e: (e.from_ns, e.happening))
+
+    @property
+    def steps_ns(self) -> list[int]:
+        """The newest times before events that tear; cheap where there are none."""
+        pending = self._pace.pending
+        last = [pending[1]] if pending is not None and pending[0] in _TEARING else []
+        return [event.from_ns for kind in _TEARING for event in self._events.get(kind, ())] + last
 
     @property
     def usual_ns(self) -> int:

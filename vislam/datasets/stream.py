@@ -221,7 +221,7 @@ class FileRecording:
         self._frames = frame_table(survey, self._counter)
         self._known = dict(self._counter)
         judges = survey.problems.judges.values()
-        self._steps_ns = [event.from_ns for judge in judges for event in judge.events if event.tears]
+        self._steps_ns = [step_ns for judge in judges for step_ns in judge.steps_ns]
         self.problems: dict[str, int] = self._counter
         self.frame_count = len(self._frames.t_ns)
         if not self.frame_count:

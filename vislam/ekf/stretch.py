@@ -11,8 +11,6 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.imu import ImuSeries
 
-_ALL = 1 << 62  # ns, after every sample
-
 
 class Stretch(NamedTuple):
     """The samples from one time to another, both ends interpolated."""
@@ -24,7 +22,7 @@ class Stretch(NamedTuple):
     end: int
 
 
-def stretch(series: ImuSeries, t0_ns: int, t1_ns: int, max_gap_ns: int, known_ns: int = _ALL) -> Stretch:
+def stretch(series: ImuSeries, t0_ns: int, t1_ns: int, max_gap_ns: int, known_ns: int) -> Stretch:
     """Return the samples between two times. The series is not empty.
 
     A step longer than `max_gap_ns` is a hole, and so is what comes after `known_ns`: samples there are assumed.

@@ -118,9 +118,10 @@ class Timeline(Generic[S, M]):
             self._take_checkpoint()
 
     def assume(self, t_ns: int) -> None:
-        """Take the newest sample for one at a frame that none reaches, as unsure as in a hole, and apply what waits.
+        """Go on to a frame that no sample reaches, as unsure as in a hole, and apply what waits.
 
-        When samples come again they say what happened meanwhile, as far back as the history reaches.
+        The newest sample fades into uniform motion. Samples that come later take its place, as far back as the history
+        reaches.
         """
         history = self._history
         if self._known_ns is None or history is None:
@@ -129,10 +130,8 @@ class Timeline(Generic[S, M]):
         while (event := history.event(number)) is not None and event.t_ns <= t_ns:
             t_ns, number = max(t_ns, self._core.time_of(event, self._state)), number + 1
         if t_ns > (self._series.newest_t_ns or t_ns):
-            uniform, share = (
-                _in_uniform_motion(self._state.x, self._gravity_m_s2),
-                np.exp((self._t_ns - t_ns) / _HABIT_NS),
-            )
+            uniform = _in_uniform_motion(self._state.x, self._gravity_m_s2)
+            share = np.exp((self._t_ns - t_ns) / _HABIT_NS)
             self._series.assume(t_ns, uniform + share * (self._series.values[-1] - uniform))
             self._run()
 

@@ -16,7 +16,7 @@ from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, ImuNoise, preintegrate
 from vislam.pipeline.inertial_stages import Inertial
 from vislam.pipeline.slip_watch import SlipWatch
-from vislam.sensors import USER_ERRORS, BodyState, Sensor, SensorError, Suite, wrong_jacobians
+from vislam.sensors import USER_ERRORS, BodyState, Sensor, Suite, wrong_jacobians
 from vislam.sensors.body import between_keyframes
 
 _MAX_WAITING = 4096  # readings that wait for the filter to begin; older ones go
@@ -236,7 +236,7 @@ class ReadingIntake:
         self._unproven[name] -= 1
         try:
             why = wrong_jacobians(self._suite[name], reading, body, self._suite.starts[self._suite.own(name)])
-        except SensorError:  # the estimators count that, reading by reading
+        except USER_ERRORS:  # the estimators count that, reading by reading
             return False
         if why:
             self.notes[name] = f"left out: {why}"

@@ -95,7 +95,7 @@ class RunInput:
         steps_ns: dict[str, list[int]] = {"imu0": [], "cam0": []}
         for judge in self._judges:
             if judge.refused[Happening.LATE] and judge.stream in steps_ns:
-                steps_ns[judge.stream] += [event.from_ns for event in judge.events if event.tears]
+                steps_ns[judge.stream] += judge.steps_ns
         for one, other in (("imu0", "cam0"), ("cam0", "imu0")):
             for at_ns in steps_ns[one]:
                 is_alone = all(abs(at_ns - t_ns) > _AT_ONCE_NS for t_ns in steps_ns[other])

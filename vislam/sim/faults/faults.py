@@ -146,8 +146,8 @@ def _as_read(events: Iterator[Event], judges: Mapping[str, StreamJudge]) -> Iter
         if stream in judges and not judges[stream].takes(value.t_ns):
             continue
         if isinstance(value, Frame):
-            steps = (event.from_ns for event in judges[stream].events if event.tears)
-            is_torn = last_ns is not None and any(last_ns <= step_ns < value.t_ns for step_ns in steps)
+            steps_ns = judges[stream].steps_ns
+            is_torn = last_ns is not None and any(last_ns <= step_ns < value.t_ns for step_ns in steps_ns)
             last_ns, value = value.t_ns, replace(value, follows_step=is_torn)  # noqa: PLW2901
         waiting.setdefault(stream, deque()).append(value)
         while all(waiting.values()):
