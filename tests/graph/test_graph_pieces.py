@@ -148,7 +148,22 @@ def test_two_places_that_habit_does_not_tell_apart_are_rivals_and_the_submap_sta
         for k in frames
     }
     assert tied(loose(world, imu=False), world, edges, 0.5).submaps.groups == (0, 1)
-    assert tied(loose(world, imu=False), world, {k: edges[k][:1] for k in frames}, 0.5).submaps.groups == (0, 0)
+    agreeing = {k: edges[k][:1] for k in frames}
+    assert tied(loose(world, imu=False), world, agreeing, 0.5).submaps.groups == (0, 0)
+    assert tied(loose(world, imu=False), world, agreeing | {152: edges[152]}, 0.5).submaps.groups == (0, 1)
+
+
+def test_a_review_lets_no_loop_in_that_tears_a_submap_from_where_habit_led(world: World) -> None:
+    true = {k: panels_further(world, (k,), 0.0, 10 * k) for k in (152, 154, 156)}
+    inside = {k: [world.loop(k, k - 9, k)] for k in (162, 164, 166)}
+    step = transform(np.eye(3), np.array([6.0, 0.0, 0.0]))
+    alike = {k: [replace(e, T_from_to=step @ e.T_from_to) for e in [world.loop(k, k - 23, k)]] for k in (168, 170, 172)}
+    graph = loose(world, imu=False)
+    tied(graph, world, true | inside | alike, 0.1)
+    graph.finish()
+    decided = {report.loop_id: report.decision for report in graph.edge_reports()}
+    assert {decided[k] for k in alike} == {LoopDecision.PENDING}
+    assert {decided[k] for k in inside} == {LoopDecision.ACCEPTED}
 
 
 def test_where_places_are_known_to_repeat_within_reach_a_submap_stays_apart(world: World) -> None:

@@ -84,7 +84,7 @@ class Waiting:
     ) -> Placement | None:
         """Return where the newer of two groups belongs, if enough of its loops agree on that; those wait no longer.
 
-        Loops that contradict the tie between two groups wait, and so do all while as many speak for another place that
+        Loops that contradict the tie between two groups wait, and so do all while one speaks for another place that
         the tie does not exclude either: a wall of equal panels fits one panel further as well.
 
         Args:
@@ -121,7 +121,7 @@ class Waiting:
         ends: _Ends,
         repeats_m: float,
     ) -> bool:
-        """Return whether another place within reach of the tie speaks against one, or too few frames for it.
+        """Return whether a loop speaks for another place within reach of the tie, or too few frames for this one.
 
         The farther the tie reaches the more frames have to agree: to each of them another panel may look most alike.
         """
@@ -134,8 +134,7 @@ class Waiting:
         if len({e.record.to_id for e in agreeing}) < JOIN_FRAMES + more:
             return True
         others = [e for e in edges if e.record.has_scale and all(e is not one for one in agreeing)]
-        rivals = [e for e in others if np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]) < reach_m]
-        return repeats_m < reach_m or len(rivals) > _JOIN_MAX_CONTRADICTING * (len(rivals) + len(agreeing))
+        return repeats_m < reach_m or any(np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]) < reach_m for e in others)
 
     def _place(
         self, edges: list[LoopModel], ends: _Ends, known: RelativeCovariance
