@@ -127,7 +127,7 @@ def test_every_reading_is_accounted_for_in_filter_and_graph(clean, readings):
         assert sum(filter_.values()) == len(offered)
         of_used = graph["outliers"] + graph["failed"]
         assert sum(graph.values()) - of_used == len(offered)
-        assert graph["used"] + graph["thinned"] > 0.7 * len(offered)
+        assert graph["used"] > 0.7 * len(offered)
         assert of_used < 0.05 * graph["used"]
         assert filter_["beginning"] == graph["beginning"] > 0
 

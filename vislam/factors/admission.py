@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-import numpy as np
-
 from vislam.core.readings import Motion, MotionReadings, PlacedReading
 from vislam.factors.reading_counts import ReadingCounts
 from vislam.factors.reading_factor import as_motion
 from vislam.sensors import USER_ERRORS, Suite
-
-MOST = 10  # readings of one sensor between two keyframes; of more, as many evenly spaced
 
 
 class Admission:
@@ -36,19 +32,12 @@ class Admission:
             self._counts.add(placed.reading.sensor, "unusable")
         return not why
 
-    def thinned(self, name: str, placed: Sequence[PlacedReading]) -> list[PlacedReading]:
-        """Return as many readings of a sensor as two keyframes may have between them."""
-        if len(placed) <= MOST:
-            return list(placed)
-        self._counts.add(name, "thinned", len(placed) - MOST)
-        return [placed[n] for n in np.linspace(0.0, len(placed) - 1.0, MOST).round().astype(int).tolist()]
-
     def for_window(self, motions: Sequence[MotionReadings], k: int) -> list[Motion]:
         """Return what a window takes of each sensor between keyframe k and the one before, where vision was lost."""
         out = []
         for motion in motions:
             name = motion.sensor
-            placed = self.thinned(name, [one for one in motion.placed if self.is_usable(one)])
+            placed = [one for one in motion.placed if self.is_usable(one)]
             if placed:
                 self._counts.add(name, "in_window", len(placed))
                 out.append(as_motion(self._suite[name], placed, motion.own, partial(self._counts.fail, name, -k)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-_ENDS = ("used", "in_window", "thinned", "early", "dropped", "unusable")  # of a reading that came with a keyframe
+_ENDS = ("used", "in_window", "early", "dropped", "unusable")  # of a reading that came with a keyframe
 
 
 class ReadingCounts:

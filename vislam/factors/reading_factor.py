@@ -1,7 +1,8 @@
 """The factor of what one sensor said between two keyframes, by the definition that every estimator uses.
 
 The residuals of all its readings stand in one factor, and each has a Cauchy kernel of its own in it, as gtsam would
-apply one: the linearised rows carry the root of the weight, and the error is the loss.
+apply one: the linearised rows carry the root of the weight, and the error is the loss. However many they are, they are
+summed up in as many rows as the factor has columns. What the inertial path between the keyframes is off by, they share.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from vislam.core.messages import Array
 from vislam.core.readings import Motion, OwnNow, PlacedReading
 from vislam.factors.noise_models import conditioned
 from vislam.sensors import USER_ERRORS, Sensor, SensorError, linearised
-from vislam.sensors.body import between_keyframes, by_keyframes, path_variances, rate_by_keyframes
-from vislam.sensors.linear import Linear
+from vislam.sensors.body import between_keyframes, by_keyframes, path_by_force, rate_by_keyframes
 
 _RATIO_MAX = 1e12  # eigenvalues of a reading's correlations
 _NOTHING = 1e-12  # square of a residual whose weight is 1
+_POSES = 12  # columns of two poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,9 +31,15 @@ class _Row:
 
     number: int  # among those of its sensor and keyframe
     placed: PlacedReading
-    whitening: Array  # [m, m]
-    cauchy_k2: float  # square of the kernel's scale, on the whitened norm
-    place: slice  # of its residual among those of the factor
+    whitening: Array  # [m, m] of its own noise
+    by_path: Array  # [m, 3] whitened, by the error of the force over its sigma
+    judging: Array  # [m, m] further whitening, by what that may be
+    cauchy_k2: float  # square of the kernel's scale, on the norm after both
+
+    def square(self, whitened: Array) -> float:
+        """Return the squared norm of a residual [m], whitened by its own noise, as the gate takes it."""
+        judged = self.judging @ whitened
+        return float(judged @ judged)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +50,8 @@ class System:
     by_earlier: Array  # [m, 6] rotation, translation on the body side
     by_later: Array  # [m, 6]
     by_own: Array  # [m, V]
-    noise: Array  # [m, m] with what the path between the keyframes adds
+    by_path: Array  # [m, 3] by the error of the force between the keyframes, over its sigma
+    noise: Array  # [m, m] its own
 
 
 def system_of(sensor: Sensor, placed: PlacedReading, T_earlier: Array, T_later: Array, own: Array) -> System:
@@ -61,15 +69,9 @@ def system_of(sensor: Sensor, placed: PlacedReading, T_earlier: Array, T_later: 
     earlier, later = (
         linear.H[:, 9:12] @ rate - linear.H[:, :9] @ pose for pose, rate in zip(moved, turned, strict=True)
     )
-    return System(linear.residual, earlier, later, -linear.H_own, _with_path(linear, placed))
-
-
-def _with_path(linear: Linear, placed: PlacedReading) -> Array:
-    """Return the noise of a reading with what is not known of the path between the keyframes."""
-    position_m2, velocity_m2_s2 = path_variances(placed.station)
-    H_p, H_v = linear.H[:, 3:6], linear.H[:, 6:9]
-    noise = linear.noise + position_m2 * (H_p @ H_p.T) + velocity_m2_s2 * (H_v @ H_v.T)
-    return np.asarray(0.5 * (noise + noise.T))
+    position_m, velocity_m_s = path_by_force(station)
+    by_path = -position_m * linear.H[:, 3:6] - velocity_m_s * linear.H[:, 6:9]
+    return System(linear.residual, earlier, later, -linear.H_own, by_path, 0.5 * (linear.noise + linear.noise.T))
 
 
 def _whitening(noise: Array) -> Array:
@@ -77,6 +79,15 @@ def _whitening(noise: Array) -> Array:
     sigmas = np.sqrt(np.diag(noise))
     correlation = conditioned(noise / np.outer(sigmas, sigmas), _RATIO_MAX)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(correlation)) / sigmas)
+
+
+def _summed(rows: Array) -> Array:
+    """Return rows [N, 3 + K] with normal equations as few as K: what the first three columns explain is left out.
+
+    Those are an unknown that all rows share, known to one.
+    """
+    R = np.asarray(np.linalg.qr(np.vstack([np.eye(3, rows.shape[1]), rows]), mode="r"))
+    return R[3:, 3:]
 
 
 class ReadingFactor:
@@ -101,7 +112,9 @@ class ReadingFactor:
         self._failed = failed
         self._rows: list[_Row] = []
         self._count = len(placed)
-        self.size = 0  # of the residual
+        self._begun: list[tuple[_Row, System]] = []  # at the poses and variables of the beginning
+        self._began_at = (*poses, own)
+        numbers = 0
         for number, one in enumerate(placed):
             try:
                 system = system_of(sensor, one, *poses, own)
@@ -109,10 +122,14 @@ class ReadingFactor:
                 failed(number)
                 continue
             m = len(system.residual)
-            limit = chi_square_limit(sensor.gate_probability, m)
             whitening = _whitening(system.noise)
-            self._rows.append(_Row(number, one, whitening, limit, slice(self.size, self.size + m)))
-            self.size += m
+            by_path = whitening @ system.by_path
+            judging = _whitening(np.eye(m) + by_path @ by_path.T)
+            limit = chi_square_limit(sensor.gate_probability, m)
+            self._rows.append(_Row(number, one, whitening, by_path, judging, limit))
+            self._begun.append((self._rows[-1], system))
+            numbers += m
+        self.size = min(numbers, _POSES + len(units) + 1)  # of the residual
 
     @property
     def is_whole(self) -> bool:
@@ -126,7 +143,9 @@ class ReadingFactor:
             poses = values.atPose3(earlier).matrix(), values.atPose3(later).matrix()
             variables = np.array([values.atDouble(key) for key in own]) * self._units
             if jacobians is None:
-                return self.losses(*poses, variables)
+                out = np.zeros(self.size)
+                out[:1] = np.sqrt(2.0 * self.loss(*poses, variables))
+                return out
             residual, by_earlier, by_later, by_own = self.weighted(*poses, variables)
             jacobians[0], jacobians[1] = np.asfortranarray(by_earlier), np.asfortranarray(by_later)
             for n in range(len(own)):
@@ -135,18 +154,19 @@ class ReadingFactor:
 
         return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self.size), [earlier, later, *own], error)
 
-    def losses(self, T_earlier: Array, T_later: Array, own: Array) -> Array:
-        """Return a residual [M] half of whose square is the loss."""
-        out = np.zeros(self.size)
+    def loss(self, T_earlier: Array, T_later: Array, own: Array) -> float:
+        """Return what the readings cost: the sum of their robust losses, less what an error of the path explains."""
+        rows = [np.zeros((0, 4))]
         for row, residual in self._residuals(T_earlier, T_later, own):
-            square = max(float(residual @ residual), _NOTHING)
-            out[row.place] = residual * np.sqrt(row.cauchy_k2 * np.log1p(square / row.cauchy_k2) / square)
-        return out
+            square = max(row.square(residual), _NOTHING)
+            root = np.sqrt(row.cauchy_k2 * np.log1p(square / row.cauchy_k2) / square)
+            rows.append(root * np.column_stack([row.by_path, residual]))
+        return 0.5 * float((_summed(np.vstack(rows)) ** 2).sum())
 
     def outliers(self, T_earlier: Array, T_later: Array, own: Array) -> int:
         """Return how many readings fail the gate of their sensor: there the kernel's weight is below a half."""
         residuals = self._residuals(T_earlier, T_later, own)
-        return sum(float(residual @ residual) > row.cauchy_k2 for row, residual in residuals)
+        return sum(row.square(residual) > row.cauchy_k2 for row, residual in residuals)
 
     def _residuals(self, T_earlier: Array, T_later: Array, own: Array) -> Iterator[tuple[_Row, Array]]:
         """Yield each reading with its whitened residual; those that fail are left out."""
@@ -164,19 +184,21 @@ class ReadingFactor:
             yield row, residual
 
     def weighted(self, T_earlier: Array, T_later: Array, own: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the residual [M] and its Jacobians [M, 6], [M, 6] and [M, V], whitened and weighted."""
-        size, count = self.size, len(self._units)
-        out = np.zeros(size), np.zeros((size, 6)), np.zeros((size, 6)), np.zeros((size, count))
+        """Return a residual [M] and its Jacobians [M, 6], [M, 6] and [M, V]: all readings, whitened and weighted."""
+        rows = [np.zeros((0, 3 + _POSES + len(self._units) + 1))]
         for row, system, residual in self._systems(T_earlier, T_later, own):
-            root = np.sqrt(row.cauchy_k2 / (row.cauchy_k2 + float(residual @ residual)))
-            out[0][row.place] = root * residual
-            parts = (system.by_earlier, system.by_later, system.by_own * self._units)
-            for whole, part in zip(out[1:], parts, strict=True):
-                whole[row.place] = root * (row.whitening @ part)
-        return out
+            root = np.sqrt(row.cauchy_k2 / (row.cauchy_k2 + row.square(residual)))
+            parts = np.hstack([system.by_earlier, system.by_later, system.by_own * self._units])
+            rows.append(root * np.column_stack([row.by_path, row.whitening @ parts, residual]))
+        summed, out = _summed(np.vstack(rows)), np.zeros((self.size, rows[0].shape[1] - 3))
+        out[: len(summed)] = summed
+        return out[:, -1], out[:, :6], out[:, 6:_POSES], out[:, _POSES:-1]
 
     def _systems(self, T_earlier: Array, T_later: Array, own: Array) -> list[tuple[_Row, System, Array]]:
         """Return each reading with its system and its whitened residual; those that fail are left out."""
+        begun, self._begun = self._begun, []  # once: they are asked for there first
+        if begun and all(map(np.array_equal, (T_earlier, T_later, own), self._began_at)):
+            return [(row, system, row.whitening @ system.residual) for row, system in begun]
         out = []
         for row in self._rows:
             try:

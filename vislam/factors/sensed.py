@@ -114,9 +114,8 @@ class Readings:
         """Return how many readings of a sensor came with keyframes, and what became of them.
 
         `used`: in factors; `in_window`: in the window's equations; `unusable`: the sensor refuses them; `early`: own
-        variables had no start yet; `thinned`: too many between two keyframes; `dropped`: where a submap begins.
-        `failed`: the sensor's own code did at some estimate, and they say nothing there. Of those used, `outliers` fail
-        its gate at `values`.
+        variables had no start yet; `dropped`: where a submap begins. `failed`: the sensor's own code did at some
+        estimate, and they say nothing there. Of those used, `outliers` fail its gate at `values`.
         """
         mine = [entry for entry in self._entries if entry.sensor == name]
         outliers = sum(entry.outliers(self._place(entry, values), self._units(name)) for entry in mine)
@@ -217,8 +216,7 @@ class Readings:
         for entry in self._entries:
             if entry.factor is not None:
                 T_earlier, T_later, own = self._place(entry, values)
-                residual = entry.factor.losses(T_earlier, T_later, own * self._units(entry.sensor))
-                total += 0.5 * float(residual @ residual)
+                total += entry.factor.loss(T_earlier, T_later, own * self._units(entry.sensor))
         return total
 
     def own(self, name: str, values: gtsam.Values, covariance: Covariance) -> tuple[Array, Array] | None:
@@ -256,7 +254,6 @@ class Readings:
 
     def _entry(self, name: str, placed: list[PlacedReading], record: KeyframeRecord) -> _Entry:
         """Return what a sensor says with a keyframe; the keys do not hang on whether its code works."""
-        placed = self.admission.thinned(name, placed)
         self._counts.add(name, "used", len(placed))
         entry = _Entry(len(self._entries), name, record.id, placed)
         if not self._suite[name].variables:

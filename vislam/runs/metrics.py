@@ -15,7 +15,7 @@ from vislam.trajectory import Alignment, Trajectory, evaluate
 
 _BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that reached neither filter nor graph
 _BY_FILTER = ("accepted", "gated", "refused", "waiting", "failed")
-_BY_GRAPH = ("used", "in_window", "thinned", "early")
+_BY_GRAPH = ("used", "in_window", "early")
 _NOT_IN_GRAPH = ("late", "unplaced", "crowded")
 
 

@@ -135,10 +135,13 @@ def rate_by_keyframes(T_earlier: Array, T_later: Array, station: Station) -> tup
     return earlier, later
 
 
-def path_variances(station: Station) -> tuple[float, float]:
-    """Return the variances per axis of position (m^2) and velocity (m^2/s^2) that an error of the force leaves."""
+def path_by_force(station: Station) -> tuple[float, float]:
+    """Return by how much an error of the force of one sigma moves position (m) and velocity (m/s) along its axis.
+
+    All readings between two keyframes share that error: where one shows the body too far ahead, so do its neighbours.
+    """
     s, T_s, sigma = station.since_s, station.length_s, station.accel_sigma_m_s2
-    return (0.5 * sigma * s * (T_s - s)) ** 2, (sigma * (s - 0.5 * T_s)) ** 2
+    return 0.5 * sigma * s * (s - T_s), sigma * (s - 0.5 * T_s)
 
 
 def _missed(T_earlier: Array, T_later: Array, station: Station) -> Array:

@@ -18,6 +18,7 @@ _REINTEGRATE_GYRO_RAD_S = 0.005  # bias change after which first-order correctio
 _REINTEGRATE_ACCEL_M_S2 = 0.05
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSES = 12  # errors of two poses
+_HEAR_AGAIN_RAD, _HEAR_AGAIN_M = 0.002, 0.01  # change of a link to which what was told of it stays linear: of 1 m/s, mm
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
 
 
@@ -130,13 +131,15 @@ class LinkStore:
             self.integrate(k, biases[k])
 
     def hear(self, X: Array, held: NDArray[np.bool_]) -> None:
-        """Linearise what further sensors said at X [n + 1, 21]; where the prior holds a state it stays as it was.
+        """Linearise what further sensors said at X [n + 1, 21], unless it is linearised near to it.
+
+        Where the prior holds a state it stays as it was. Neither place shows in it, so that both may move together.
 
         Own variables are not the window's: they are eliminated link by link, with the sigmas that they came with.
         """
         links = self._links
         for k, motions in enumerate(self._motions):
-            if not motions or (links.told[k] and (held[k] or held[k + 1])):
+            if not motions or (links.told[k] and (held[k] or held[k + 1] or _is_near(X[k : k + 2], links.told_at[k]))):
                 continue
             H, b = np.zeros((_POSES, _POSES)), np.zeros(_POSES)
             R_a, R_b = X[k, :9].reshape(3, 3), X[k + 1, :9].reshape(3, 3)
@@ -185,6 +188,13 @@ class LinkStore:
             out[_VELOCITY, _VELOCITY] += np.eye(3) * (leak * (0.5 * hole + after)) ** 2
             out[_POSITION, _POSITION] += np.eye(3) * (0.5 * leak * (0.5 * hole + after) ** 2) ** 2
         return out
+
+
+def _is_near(X: Array, told_at: Array) -> bool:
+    """Return whether two states [2, 21] are turned, and apart, as they were; wherever they are."""
+    changed = np.abs(X - told_at)
+    apart = np.abs(np.diff(X[:, 9:12] - told_at[:, 9:12], axis=0))
+    return bool(changed[:, :9].max() < _HEAR_AGAIN_RAD and apart.max() < _HEAR_AGAIN_M)
 
 
 def jacobian_by_bias(span: Preintegrated) -> Array:

@@ -6,7 +6,7 @@ from vislam.runs.report.html import Cell, card, note, number, section, table
 from vislam.runs.report.run_files import RunFiles, as_dict, as_list
 
 _ESTIMATORS = ("filter", "graph")
-_IN_GRAPH = ["sensor", "used", "in window", "outliers", "failed", "thinned", "beginning", "not there"]
+_IN_GRAPH = ["sensor", "used", "in window", "outliers", "failed", "beginning", "not there"]
 _NOT_THERE = ("late", "unplaced", "at_submap", "after", "too_early", "early", "dropped", "crowded", "queued")
 
 
@@ -71,7 +71,7 @@ def _in_graph(name: str, counted: dict[str, object]) -> list[str | Cell]:
     if not counted:
         return []
     missing = sum(value for key in _NOT_THERE if isinstance(value := counted.get(key), int))
-    shown = [counted.get(key) for key in ("used", "in_window", "outliers", "failed", "thinned", "beginning")]
+    shown = [counted.get(key) for key in ("used", "in_window", "outliers", "failed", "beginning")]
     return [name, *(number(value, 0) for value in (*shown, missing))]
 
 
