@@ -27,7 +27,7 @@ from vislam.sensors import Suite
 
 
 class Slam:
-    """Camera and IMU in, poses and map out; deterministic, one thread."""
+    """Camera, if any, and IMU in, poses and map out; deterministic, one thread."""
 
     def __init__(
         self, config: Config, rig: Rig, noise: ImuNoise | None = None, suite: Suite | None = None,
@@ -40,9 +40,9 @@ class Slam:
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock, suite)
         self._intake = KeyframeIntake(rig, self.front, self.clock, suite, labeller)
-        self._in_map = InMap(config.publish)
+        self._in_map = InMap(config.publish, rig.is_blind)
         self._frames: deque[Frame] = deque()
-        self._silence = SilentCamera() if suite is not None and len(suite) and noise is not None else None
+        self._silence = SilentCamera(rig) if noise is not None and (rig.is_blind or suite) else None
 
     def __repr__(self) -> str:
         return f"Slam({self.front.frontend.mode}, {0 if self.back is None else len(self.back.graph.poses())} keyframes)"
@@ -64,6 +64,8 @@ class Slam:
         around it. Raises DataError when the memory contradicts itself.
         """
         self.front.resume(memory.front)
+        if self._silence is not None:
+            self._silence.go_on(memory.front.camera_t_ns)
         update = self._intake.resume(memory)
         self._in_map.place.submaps = update.submaps
         return update
@@ -105,11 +107,8 @@ class Slam:
         return Finish(steps, keyframes, *self._intake.finish())
 
     def _go_on_without_images(self, value: ImuSample | MagSample | Reading) -> None:
-        if self._silence is None or not isinstance(value, ImuSample) or self.front.begun.settled is None:
-            return
-        stand_in = self._silence.stand_in(value.t_ns)
-        if stand_in is not None:
-            self._frames.append(stand_in)
+        if self._silence is not None and isinstance(value, ImuSample):
+            self._frames += self._silence.stand_in(value.t_ns, self.front.begun.settled is not None)
 
     def _step(self, frame: Frame) -> Step:
         front = self.front.process(frame)

@@ -11,6 +11,7 @@ import pytest
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.recording import with_camera
 from vislam.datasets import open_dataset
 from worlds.mini_recording import (
     BEGIN_NS,
@@ -329,10 +330,13 @@ def test_missing_sensor_files_say_what_to_write(tmp_path: Path) -> None:
         open_dataset(str(tmp_path))
 
 
-def test_inertial_recording_without_camera_cannot_be_opened(tmp_path: Path) -> None:
+def test_an_inertial_recording_is_opened_without_a_camera(tmp_path: Path) -> None:
     write_imu(tmp_path / "mav0", imu_rows(10))
-    with pytest.raises(DataError, match="holds no camera images"):
-        open_dataset(str(tmp_path))
+    recording = open_dataset(str(tmp_path))
+    assert recording.rig.is_blind and recording.frame_count == 0
+    assert [type(value).__name__ for value in recording.events()] == ["ImuSample"] * 10
+    with pytest.raises(DataError, match="holds no camera images, which this works on"):
+        with_camera(recording)
 
 
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:

@@ -101,18 +101,18 @@ def test_filter_and_graph_go_on_by_wheels_while_the_camera_is_silent() -> None:
 
 
 def test_a_camera_is_stood_in_for_once_a_second_after_five() -> None:
-    silence = SilentCamera()
-    assert silence.stand_in(100 * SECOND_NS) is None  # no frame yet
+    silence = SilentCamera(open_source("points:cart-drive,duration_s=1").rig)
+    assert silence.stand_in(100 * SECOND_NS) == []  # no frame yet
     nothing = Observations(np.arange(3), np.zeros((3, 2)), np.zeros((3, 2)))
     silence.see(Frame(0, 7, (), tracks=nothing))
-    came = [frame for k in range(200) if (frame := silence.stand_in(k * SECOND_NS // 10)) is not None]
+    came = [frame for k in range(200) for frame in silence.stand_in(k * SECOND_NS // 10)]
     assert [frame.t_ns for frame in came] == [k * SECOND_NS - 1 for k in range(5, 20)]
     assert silence.frames == 15
     tracks = came[0].tracks
     assert tracks is not None
     assert len(tracks.track_ids) == len(tracks.pixels_px) == len(tracks.right_px) == 0
     silence.see(Frame(20 * SECOND_NS, 8, (), tracks=nothing))
-    assert silence.stand_in(24 * SECOND_NS) is None
+    assert silence.stand_in(24 * SECOND_NS) == []
 
 
 def test_a_dark_frame_has_the_shape_of_the_one_before() -> None:
@@ -130,7 +130,9 @@ def test_a_run_is_resumed_where_the_camera_was_silent(tmp_path: Path) -> None:
     frames = [Frame(k * SECOND_NS, k, (image,)) for k in (0, 1, 9)]
     samples = [ImuSample(k * SECOND_NS // 2, np.zeros(3), np.zeros(3)) for k in range(20)]
     values = sorted([*frames, *samples], key=lambda value: value.t_ns)
-    recording = SimpleNamespace(events=lambda from_ns=None: iter(values), name="a cart", problems={})
+    recording = SimpleNamespace(
+        events=lambda from_ns=None: iter(values), name="a cart", problems={}, rig=SimpleNamespace(is_blind=False)
+    )
     further = SimpleNamespace(among=lambda events: events, suite=None, problems={})
     memory = SimpleNamespace(camera_t_ns=6 * SECOND_NS - 1, t_ns=6 * SECOND_NS - 1)
     came = list(RunInput(recording, further, tmp_path).values(memory))

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 from vislam.config.ranges import Count, Finite, NonNegative, Positive, Share, Whole
 from vislam.core.kinds import check_name
 
-_OwnMode = Literal["auto", "mono", "stereo", "rgbd", "planar"]
+_OwnMode = Literal["auto", "mono", "stereo", "rgbd", "planar", "none"]
 Mode = _OwnMode | str  # or what a package brings: docs/extend.md
 
 

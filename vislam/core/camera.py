@@ -303,14 +303,14 @@ def _smallest_positive_root(polynomial: np.polynomial.Polynomial) -> float:
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a recording and where they sit on the body; depth, if any, is registered to cam0."""
+    """The cameras of a recording, if any, and where they sit on the body; depth, if any, is registered to cam0."""
 
     cameras: tuple[Camera, ...]
     T_body_cams: tuple[Array, ...]  # [4, 4] each
     has_depth: bool = False
 
     def __post_init__(self) -> None:
-        if not self.cameras or len(self.cameras) != len(self.T_body_cams):
+        if len(self.cameras) != len(self.T_body_cams) or (self.has_depth and not self.cameras):
             raise DataError(f"a rig needs one pose per camera, got {len(self.cameras)} and {len(self.T_body_cams)}")
         for index, T in enumerate(self.T_body_cams):
             if T.shape != (4, 4) or not are_rotations(T[:3, :3], 1e-3):
@@ -321,9 +321,19 @@ class Rig:
         return f"Rig({len(self.cameras)} cameras: {cameras}{', depth' if self.has_depth else ''})"
 
     @property
+    def is_blind(self) -> bool:
+        """Whether there is no camera."""
+        return not self.cameras
+
+    @property
     def is_stereo(self) -> bool:
         """Whether there is a second camera."""
         return len(self.cameras) > 1
+
+    @property
+    def T_body_cam0(self) -> Array:
+        """Pose [4, 4] of the first camera in the body; the identity without one."""
+        return self.T_body_cams[0] if self.cameras else np.eye(4)
 
     @property
     def T_cam0_cam1(self) -> Array:

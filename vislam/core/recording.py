@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from vislam.core.camera import Rig
+from vislam.core.errors import DataError
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.streams import StreamJudge
@@ -35,6 +36,13 @@ class Recording(Protocol):
     def truth(self) -> Trajectory | None:
         """Return the true body trajectory in a world frame, or None."""
         ...
+
+
+def with_camera(recording: Recording) -> Recording:
+    """Return a recording; raises DataError where it has no camera."""
+    if recording.rig.is_blind:
+        raise DataError(f"{recording.name} holds no camera images, which this works on; give a recording with some")
+    return recording
 
 
 class WrappedRecording:

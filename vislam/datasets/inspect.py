@@ -170,8 +170,10 @@ class _Inspector:
 
     def _check_cameras(self, frames: FrameTable | None) -> None:
         found = self._found
-        if not found.cameras:
-            self._add("error", "no camera images", str(found.root), "this can be evaluated but not run")
+        if not found.cameras and found.has_imu:
+            self._add("ok", "no camera: it runs by the IMU and what --sensors.file names", str(found.root))
+        elif not found.cameras:
+            self._add("error", "neither camera images nor an IMU", str(found.root), "it can be evaluated but not run")
         streams = [*found.cameras, *([found.depth] if found.depth is not None else [])]
         for index, images in enumerate(streams):
             self._check_stream(images.name, images.t_ns)

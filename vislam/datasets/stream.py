@@ -167,6 +167,8 @@ def image_list(
 
 def frame_table(survey: Survey, problems: Problems) -> FrameTable:
     """Return which images form a frame; stereo images without a partner and frames without depth are counted."""
+    if not survey.cameras:
+        return FrameTable(np.zeros(0, np.int64), np.zeros((0, 0), np.int64), np.zeros(0, np.int64))
     first = survey.cameras[0].t_ns
     rows = [np.arange(len(first))]
     for other in survey.cameras[1:]:
@@ -209,10 +211,13 @@ class FileRecording:
         """Open what a survey found; raises DataError when it cannot be replayed, or images and calibration differ."""
         for error in (*survey.errors, *survey.lacking.values()):
             raise error
-        if survey.rig is None or not survey.cameras:
-            raise DataError(f"{survey.root} holds no camera images; `vislam doctor` shows what it holds")
+        rig = Rig((), ()) if not survey.cameras and survey.has_imu else survey.rig
+        if rig is None or bool(rig.cameras) != bool(survey.cameras):
+            raise DataError(
+                f"{survey.root} holds neither camera images nor an IMU; `vislam doctor` shows what it holds"
+            )
         self.name = survey.root.resolve().name
-        self.rig: Rig = survey.rig
+        self.rig: Rig = rig
         self.imu_noise: ImuNoise | None = survey.imu_noise
         self.cameras_read = len(survey.cameras)  # fewer, where the images of the others are not needed
         self._survey = survey
@@ -224,7 +229,7 @@ class FileRecording:
         self._steps_ns = [step_ns for judge in judges for step_ns in judge.steps_ns]
         self.problems: dict[str, int] = self._counter
         self.frame_count = len(self._frames.t_ns)
-        if not self.frame_count:
+        if not self.frame_count and survey.cameras:
             names = " and ".join(camera.name for camera in survey.cameras)
             raise DataError(f"{survey.root} has no frame: {names} share no image within {STEREO_TOLERANCE_NS} ns")
         self._check_first_images()
@@ -267,6 +272,8 @@ class FileRecording:
 
     def _check_first_images(self) -> None:
         """Compare the first readable image of each camera with its calibration, before a run starts."""
+        if self.rig.is_blind:
+            return
         if self._survey.video is not None:
             open_loader(self._survey, self.rig, self._frames).close()
             return
@@ -284,6 +291,8 @@ class FileRecording:
 
     def _read_frames(self, from_ns: int | None) -> Generator[Frame, None, None]:
         last_ns = None
+        if self.rig.is_blind:
+            return
         with closing(open_loader(self._survey, self.rig, self._frames, self.cameras_read)) as loader:
             index = 0 if from_ns is None else int(np.searchsorted(self._frames.t_ns, from_ns))
             with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers)) as decoded:

@@ -27,4 +27,4 @@ def make_ekf(
     """
     if config.coupling == "tight":
         return MsckfEkf(config, noise, machine, rig, suite)
-    return Ekf(config, noise, machine, rig.T_body_cams[0], suite)
+    return Ekf(config, noise, machine, rig.T_body_cam0, suite)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from vislam.config import FrontEndConfig
 from vislam.config.frontend import Mode
 from vislam.core.camera import Rig
+from vislam.core.errors import UsageError
 from vislam.core.kinds import Kinds, lacking
 from vislam.frontend.metric import RgbdFrontEnd, StereoFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
+from vislam.frontend.no_camera import NoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.frontend.result import CommonErrors, FrontEnd, TrackResult
 from vislam.imu import ImuNoise
@@ -17,7 +19,13 @@ __all__ = ["FRONT_ENDS", "FrontEnd", "TrackResult", "common_errors", "knows_scal
 
 FRONT_ENDS = Kinds[type[FrontEnd]](
     "vislam.front_ends",
-    {"rgbd": RgbdFrontEnd, "stereo": StereoFrontEnd, "mono": MonoFrontEnd, "planar": PlanarFrontEnd},
+    {
+        "rgbd": RgbdFrontEnd,
+        "stereo": StereoFrontEnd,
+        "mono": MonoFrontEnd,
+        "planar": PlanarFrontEnd,
+        "none": NoFrontEnd,
+    },
     lacking("knows_scale", "errors", "track", "begin_at"),
 )
 
@@ -30,8 +38,13 @@ def knows_scale(mode: str) -> bool:
 def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
     """Return the name of the front end that a configuration means.
 
-    `auto` takes the richest that the rig allows; one camera whose height above a floor is known is `planar`.
+    `auto` takes the richest that the rig allows; one camera whose height above a floor is known is `planar`. Raises
+    UsageError where one is to look through a camera that there is not.
     """
+    if rig.is_blind:
+        if config.mode not in ("auto", "none"):
+            raise UsageError(f"--frontend.mode {config.mode} needs a camera, and the recording has none; leave it away")
+        return "none"
     if config.mode != "auto":
         return config.mode
     one_camera: Mode = "mono" if config.planar.height_m is None else "planar"

@@ -113,10 +113,14 @@ class CameraFeed:
         """Whether the newest frame is one of long ago again, and shows nothing of its own time."""
         return self._same >= _STUCK_ROWS and self._changed > _ALIVE and not self._has_new_depth
 
-    def add(self, frame: Frame) -> None:
-        """Take a frame as the camera gave it; `moved` has to follow."""
+    def count(self, frame: Frame) -> None:
+        """Take note of a frame that no camera gave."""
         self.frames += 1
         self.first_t_ns = frame.t_ns if self.first_t_ns is None else self.first_t_ns
+
+    def add(self, frame: Frame) -> None:
+        """Take a frame as the camera gave it; `moved` has to follow."""
+        self.count(frame)
         usual_ns = self.judge.usual_ns
         self.judge.takes(frame.t_ns)
         if self._last_t_ns is not None and usual_ns:

@@ -294,7 +294,7 @@ class PoseGraph:
 
 def _lever_m(rig: Rig) -> Array:
     """Return where cam0 is in the body [3]."""
-    return np.array(rig.T_body_cams[0][:3, 3], dtype=np.float64)
+    return np.array(rig.T_body_cam0[:3, 3], dtype=np.float64)
 
 
 def _source(

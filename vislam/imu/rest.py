@@ -8,7 +8,7 @@ import numpy as np
 
 from vislam.config import InitConfig
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.messages import AS_MODELLED, Array, ImuSpan, NoiseScale
+from vislam.core.messages import AS_MODELLED, Array, ImuSpan, NavState, NoiseScale
 from vislam.imu.series import join
 
 _REST_GYRO_STD_RAD_S = 0.03  # idling EuRoC drone 0.007 to 0.03, hovering above 0.065 (0.5 s windows)
@@ -16,6 +16,7 @@ _REST_GYRO_STD_RAD_S = 0.03  # idling EuRoC drone 0.007 to 0.03, hovering above 
 _REST_ACCEL_STD_M_S2 = 0.4
 _REST_GYRO_MAX_RAD_S = 0.7  # mean rate: only the boot bias of a cheap gyro (ITG3205: 40 deg/s) may show
 _NS = 1_000_000_000
+_SLOW_M_S = 0.1
 _NOISE_SIGMAS = 3.0  # a sensor noisier than the thresholds assume must still be able to rest
 _SET_OFF_M_S = 0.02  # gained since the force was that of rest: a filter takes rest's speed for zero to 5 mm/s
 _MEMORY_S = 2.0  # of the force at rest: biases and tilt wander
@@ -33,6 +34,15 @@ def still_limits(noise: ImuNoise, scale: NoiseScale = AS_MODELLED) -> tuple[floa
     gyro = max(_REST_GYRO_STD_RAD_S, per_sample * noise.gyroscope_noise_density * scale.gyro)
     accel = max(_REST_ACCEL_STD_M_S2, per_sample * noise.accelerometer_noise_density * scale.accel)
     return gyro, accel, _REST_GYRO_MAX_RAD_S
+
+
+def is_slow(state: NavState) -> bool:
+    """Return whether an estimator is sure that its body hardly moves.
+
+    An IMU alone cannot distinguish rest from uniform motion: still samples are rest only where this holds.
+    """
+    sigma_m_s = float(np.sqrt(np.trace(state.covariance[6:9, 6:9])))
+    return max(float(np.linalg.norm(state.velocity_world_m_s)), sigma_m_s) < _SLOW_M_S
 
 
 class RestDetector:

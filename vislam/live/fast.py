@@ -19,7 +19,7 @@ from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking
 from vislam.ekf.correction import AppliedReading, Correction, Hint
 from vislam.ekf.loose.filter import Ekf
 from vislam.hw.health import Health
-from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector
+from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector, is_slow
 from vislam.live.inertial_only import InertialOnly
 from vislam.live.notices import CameraHealth, Doubted, MapMoved, Rebase, Start, ToFast
 from vislam.live.wire.published_pose import PublishedPose, of_base
@@ -28,7 +28,6 @@ from vislam.trajectory.continuity import Continuity, in_odom
 
 _IMU_TIMEOUT_S = 0.1  # without a sample for so long the pose is old: invalid
 # without vision, still inertial data mean rest only below this speed and its sigma
-_REST_SPEED_M_S = 0.1
 _NS = 1_000_000_000
 _REST_STEP_NS = 100_000_000  # rest is asked for so often
 _LOOK_NS = 50_000_000  # and the sensors for their health
@@ -273,10 +272,7 @@ class FastPath:
         self._rest_t_ns = t_ns
         if not self._started or self._ekf.dead_reckoning_s <= self._config.live.vision_timeout_s:
             return None
-        state = self._ekf.state()
-        limit = _REST_SPEED_M_S
-        is_slow = float(np.linalg.norm(state.velocity_world_m_s)) < limit and self._velocity_sigma(state) < limit
-        hint = Hint(t_ns, at_rest=rests and is_slow)
+        hint = Hint(t_ns, at_rest=rests and is_slow(self._ekf.state()))
         self._at_rest = hint.at_rest
         if not hint.at_rest and self._config.machine.slip_sigma_m_s is None:
             return None

@@ -7,11 +7,13 @@ from enum import StrEnum
 
 import numpy as np
 
+from vislam.core.camera import Rig
 from vislam.core.messages import Frame, Keyframe, KeyframePacket, NavState, Tracking, VoMeasurement
 
-_PATIENCE_S = 5.0  # without sight; until then the camera may find the last keyframe again
-_EVERY_S = 1.0  # from then on
-_SLACK_S = 0.05  # frames do not come to the millisecond
+_PATIENCE_NS = 5_000_000_000  # without sight; until then the camera may find the last keyframe again
+_EVERY_NS = 1_000_000_000  # from then on
+_SLACK_NS = 50_000_000  # frames do not come to the millisecond
+_LOOK_NS = 100_000_000  # without a camera: between two poses of the trajectories, and two looks whether the body rests
 
 
 class Sight(StrEnum):
@@ -30,22 +32,26 @@ class Waypoints:
 
     Attributes:
         sight: now.
+        is_blind: there is no camera, and no loop would join what the filter leaves in doubt: keyframes always go on.
     """
 
-    def __init__(self) -> None:
-        """Start before the first frame."""
-        self.sight = Sight.SEEING
+    def __init__(self, rig: Rig) -> None:
+        """Start before the first frame; without a camera it is dark from the start."""
+        self.sight = Sight.DARK if rig.is_blind else Sight.SEEING
+        self.is_blind = rig.is_blind
         self._since_ns: int | None = None  # the last frame that was placed, or waypoint; None: no frame yet
         self._ends = False  # whether sight is back since `marked`
 
     def wants(self, vo: VoMeasurement, is_keyframe: bool) -> bool:
         """Take note of a frame; return whether it is time for a keyframe, though vision gives none."""
+        if self.is_blind and self._since_ns is None:
+            self._since_ns = vo.t_ns
+            return True
         if vo.tracking is not Tracking.LOST or is_keyframe or self._since_ns is None:
             self._ends = self._ends or self.sight is Sight.DARK
             self.sight, self._since_ns = Sight.SEEING, vo.t_ns
             return False
-        wait_s = _EVERY_S if self.sight is Sight.DARK else _PATIENCE_S
-        if (vo.t_ns - self._since_ns) * 1e-9 < wait_s - _SLACK_S:
+        if vo.t_ns - self._since_ns < (_EVERY_NS if self.sight is Sight.DARK else _PATIENCE_NS) - _SLACK_NS:
             self.sight = Sight.LOST if self.sight is Sight.SEEING else self.sight
             return False
         self.sight, self._since_ns = Sight.DARK, vo.t_ns
@@ -60,31 +66,45 @@ class Waypoints:
 class SilentCamera:
     """Stands in for a camera that is silent: frames in which it is dark, so that all goes on as for a covered one.
 
+    Where there is no camera, the frames are empty and come with the IMU from its first sample on.
+
     Attributes:
+        is_all: whether there is no camera, and all frames are put in.
         frames: that were put in.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rig: Rig) -> None:
         """Start before the first frame."""
+        self.is_all = rig.is_blind
         self.frames = 0
         self._last: Frame | None = None  # of the camera
         self._newest_ns = 0  # dark ones included
+        self._patience_ns, self._every_ns = (0, _LOOK_NS) if self.is_all else (_PATIENCE_NS, _EVERY_NS)
 
     def see(self, frame: Frame) -> None:
         """Take a frame of the camera."""
         self._last, self._newest_ns = frame, frame.t_ns
 
-    def stand_in(self, t_ns: int) -> Frame | None:
-        """Return the dark frame that is due at a time, a nanosecond before it; None: there is none.
+    def go_on(self, t_ns: int) -> None:
+        """Go on after the frame of a time, where an earlier run ended; without a camera its frame was one of these."""
+        if self.is_all:
+            self.see(Frame(t_ns, 0, ()))
 
-        The camera's own next frame has that time, or a later one.
+    def stand_in(self, t_ns: int, has_begun: bool = True) -> list[Frame]:
+        """Return the dark frame that is due at a time, a nanosecond before it, if there is one.
+
+        The camera's own next frame has that time, or a later one. Before a run `has_begun` a camera is waited for.
         """
+        if not (has_begun or self.is_all):
+            return []
+        if self.is_all and self._last is None:
+            self.see(Frame(t_ns, 0, ()))
         last = self._last
-        if last is None or t_ns - last.t_ns < _PATIENCE_S * 1e9 or t_ns - self._newest_ns < _EVERY_S * 1e9:
-            return None
+        if last is None or t_ns - last.t_ns < self._patience_ns or t_ns - self._newest_ns < self._every_ns:
+            return []
         self._newest_ns = t_ns - 1
         self.frames += 1
-        return dark(last, self._newest_ns)
+        return [dark(last, self._newest_ns)]
 
 
 def unseen_keyframe(keyframe_id: int, frame: Frame) -> Keyframe:

@@ -79,21 +79,24 @@ class Front:
         self.frontend = make_frontend(config.frontend, rig, config.seed)
         refuse_without_scale(config.ekf, self.frontend.knows_scale, noise is not None)
         self.camera_clock = CameraClock(config.init)
-        self.begun, self.watch = Start(noise is not None), RunWatch(config.init, self.frontend.knows_scale)
+        self.begun = Start(noise is not None)
+        self.watch = RunWatch(config.init, self.frontend.knows_scale, rig.is_blind)
         # without gravity, up is where the first image has it
-        self._T_upright = transform(level_rotation(-rig.T_body_cams[0][:3, 1]), np.zeros(3))
-        self._chain = KeyframeChain(self._T_upright if noise is None else np.eye(4), config.ekf.submap_sigma_m)
+        self._T_upright = np.eye(4) if rig.is_blind else _upright(rig)
+        most_m = np.inf if rig.is_blind else config.ekf.submap_sigma_m  # no loop would join submaps
+        self._chain = KeyframeChain(self._T_upright if noise is None else np.eye(4), most_m)
         self.inertial: Inertial | None = None
         self.gravity: GravityWait | None = None
         if noise is not None:
             self.inertial = Inertial(config, rig, noise, suite)
             self.gravity = GravityWait(
-                config, rig, noise, self.begun, self._chain, self.inertial, self.frontend.knows_scale
+                config, rig, noise, self.begun, self._chain, self.inertial, self.frontend.knows_scale,
+                lambda: None if self.readings is None else self.readings.moves(),
             )  # fmt: skip
         self.readings: ReadingIntake | None = None
         if suite is not None and len(suite):
             self.readings = ReadingIntake.of_run(config, suite, noise, self.inertial)
-        self._clock, self._waypoints, self._published = clock, Waypoints(), in_odom(config)
+        self._clock, self._waypoints, self._published = clock, Waypoints(rig), in_odom(config)
         self._last_frame_t_ns: int | None = None
 
     def resume(self, memory: FrontMemory) -> None:
@@ -229,18 +232,19 @@ class Front:
 
     def _as_waypoint(self, frame: Frame, track: TrackResult) -> TrackResult:
         """Return the track, as that of a keyframe where vision gives none for long and the filter knows the way."""
-        imu = self._imu
-        if self.readings is None or imu is None or self.begun.holds_keyframes:
+        imu, chain, is_blind = self._imu, self._chain, self._waypoints.is_blind
+        if (self.readings is None and not is_blind) or imu is None or self.begun.holds_keyframes:
             return track
         state = imu.filtering.ekf.state_at(frame.t_ns)
         if state is None or not self._waypoints.wants(track.vo, track.keyframe is not None):
             return track
-        if not self._chain.is_bridged(frame.t_ns, imu.buffer.span(self._chain.t_ns, frame.t_ns), state):
+        if not (is_blind or chain.is_bridged(frame.t_ns, imu.buffer.span(chain.t_ns, frame.t_ns), state)):
             return track
         self.watch.counters["waypoints"] = self.watch.counters.get("waypoints", 0) + 1
-        keyframe = unseen_keyframe(self._chain.id + 1, frame)
+        keyframe = unseen_keyframe(chain.id + 1, frame)
         seek_place(self.frontend, keyframe.id + 1)
-        return replace(track, keyframe=keyframe, vo=lost_motion(frame.t_ns, self._chain.id, track.vo.has_scale))
+        lost = lost_motion(frame.t_ns, chain.id, track.vo.has_scale)
+        return replace(track, keyframe=keyframe, vo=self.begun.begin_blind(state) if chain.id < 0 else lost)
 
     def _estimate(self, track: TrackResult, since: Since, at_rest: bool) -> tuple[Estimate | None, NavState | None]:
         """Return the pose in `odom` and the filter's state after this frame."""
@@ -295,6 +299,11 @@ class Front:
     def report(self) -> FrontReport:
         """Return what there is to say of the run so far."""
         return report_of(self)
+
+
+def _upright(rig: Rig) -> Array:
+    """Return what turns the body [4, 4] so that the first camera's image is upright."""
+    return transform(level_rotation(-rig.T_body_cams[0][:3, 1]), np.zeros(3))
 
 
 def odometry(front: Front, values: Iterable[ImuSample | MagSample | Reading | Frame]) -> Iterator[FrontStep]:

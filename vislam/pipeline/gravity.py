@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
 
@@ -16,7 +17,9 @@ from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, VoMea
 from vislam.ekf.tight import EarlyFrames, known_from
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.result import identity_motion
 from vislam.frontend.start import Initialisation, Initialiser, level_at_once, moved_to
+from vislam.pipeline.blind_start import BlindStart
 from vislam.pipeline.chain import KeyframeChain
 from vislam.pipeline.inertial_stages import Inertial
 from vislam.trajectory import Trajectory
@@ -106,6 +109,11 @@ class Start:
         """Believe a start."""
         self.settled, self.phase = found, Phase.SETTLED
 
+    def begin_blind(self, state: NavState) -> VoMeasurement:
+        """Take the filter's state at the first keyframe of a run without a camera; return the motion up to it: none."""
+        self.first_state = state
+        return identity_motion(state.t_ns, 0, True, 0)
+
     def give_up(self) -> None:
         """Go on without gravity, by vision that is metric."""
         self.phase = Phase.VISION_ALONE
@@ -126,11 +134,12 @@ class GravityWait:
         chain: KeyframeChain,
         inertial: Inertial,
         knows_scale: bool,
+        moves: Callable[[], bool | None],
     ) -> None:
         """Bring `start` forward from the samples of `inertial`, and start its filter.
 
         `chain` is that of the keyframes. `knows_scale` is whether vision measures metres: where it does not, what is
-        seen before scale is known is kept.
+        seen before scale is known is kept. `moves` is what sensors of motion say, see `ReadingIntake.moves`.
         """
         self.counters: dict[str, int] = {}
         self._start, self._chain = start, chain
@@ -140,10 +149,15 @@ class GravityWait:
         self._refused: Initialisation | None = None  # the newest answer without a state
         self._waiting = WaitingKeyframes()
         self._early = None if knows_scale else EarlyFrames(config.ekf, rig, config.machine)
-        self._initialiser = Initialiser(
-            config.init, noise, config.machine.gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
-            config.frontend.track_sigma_px, config.window,
-        )  # fmt: skip
+        gravity_m_s2 = config.machine.gravity_m_s2
+        self._initialiser: Initialiser | BlindStart
+        if rig.is_blind:
+            self._initialiser = BlindStart(config.init, noise, gravity_m_s2, moves)
+        else:
+            self._initialiser = Initialiser(
+                config.init, noise, gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],
+                config.frontend.track_sigma_px, config.window,
+            )  # fmt: skip
 
     @property
     def search_counters(self) -> dict[str, dict[str, int]]:
@@ -251,7 +265,8 @@ class GravityWait:
         """Start the filter, again if it runs; return what waited once the start is settled."""
         assert found.last is not None and found.T_odom_vo is not None
         self._start.try_out(found)
-        self._filtering.start(found.last, vo)
+        sees = vo.T_keyframe_body is not None
+        self._filtering.start(found.last, vo if sees else identity_motion(found.last.t_ns, -1, True, 0))
         if not found.is_settled:
             return []
         self._start.settle(found)

@@ -13,7 +13,7 @@ from vislam.ekf.filtering import Filtering
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.stillness import Stillness
-from vislam.imu import ConditionWatch, ImuBuffer, ImuNoise, RestDetector, pose_after, subtract_bias
+from vislam.imu import ConditionWatch, ImuBuffer, ImuNoise, RestDetector, is_slow, pose_after, subtract_bias
 from vislam.pipeline.steps import Estimate
 from vislam.sensors import Suite
 
@@ -46,7 +46,7 @@ class Inertial:
         self.buffer = ImuBuffer(config.imu, config.machine, noise)
         self.condition = ConditionWatch()
         self.filtering = Filtering(config.ekf, noise, config.machine, rig, suite)
-        self._rest = RestDetector(config.init, noise)
+        self._rest, self._is_blind = RestDetector(config.init, noise), rig.is_blind
         self._stillness = Stillness()
         self._is_corrected = config.ekf.vision != "none"
         self._gravity_m_s2, self._bias_walk = config.machine.gravity_m_s2, noise.gyroscope_random_walk
@@ -75,7 +75,13 @@ class Inertial:
         return Since(span, state, unbiased, sigma_rad_s, motion)
 
     def rests(self, track: TrackResult, span: ImuSpan | None) -> tuple[bool, bool]:
-        """Return whether the image stood still up to a frame, and whether the body rests by image and samples."""
+        """Return whether the image stood still up to a frame, and whether the body rests by image and samples.
+
+        Without a camera: whether the samples were still, and whether the body rests by them and the filter's speed.
+        """
+        if self._is_blind:
+            still, state = self._rest.add(span), self.filtering.state
+            return still, still and state is not None and is_slow(state)
         still_image = self._stillness.add(track.vo.t_ns, track.observations)
         return still_image, self._rest.add(span) and self._stillness.resting
 

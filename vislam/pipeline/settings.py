@@ -25,9 +25,11 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
     if not isinstance(parse_up(config.up), str) or config.up != "auto":
         refuse_up(noise)
     mode = mode_for(config.frontend, rig)
+    if rig.is_blind:
+        config = _without_camera(config, noise)
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
     errors = common_errors(config.frontend, rig, noise)
-    by_imu = noise is not None and not rig.is_stereo and not rig.has_depth
+    by_imu = noise is not None and len(rig.cameras) == 1 and not rig.has_depth
     scale_sigma = max(config.graph.scale_sigma, errors.scale_sigma)
     graph = replace(config.graph, scale_sigma=scale_sigma, edges_share_scale=by_imu)
     machine = config.machine
@@ -72,6 +74,19 @@ def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
     """
     coupling = graph.coupling if rig.is_stereo or rig.has_depth else "loose"
     return replace(graph, coupling=coupling, edges_share_scale=False)
+
+
+def _without_camera(config: Config, noise: ImuNoise | None) -> Config:
+    """Return the settings of a run without a camera: no window, no places to recognise, no map of what is seen.
+
+    Raises UsageError where no IMU is there either.
+    """
+    if noise is None:
+        raise UsageError("a run without a camera needs its IMU, and there is none: leave --imu.no-enabled away")
+    return replace(
+        config, graph=replace(config.graph, coupling="loose"), loop=replace(config.loop, enabled=False),
+        map=replace(config.map, enabled=False),
+    )  # fmt: skip
 
 
 def _filter(config: Config, mode: str, errors: CommonErrors) -> EkfConfig:

@@ -79,6 +79,8 @@ class RunInput:
 
     def _stand_in(self, begin_ns: int) -> Frame | None:
         """Return the dark frame that the last keyframe was, where the camera was silent, see `SilentCamera`."""
+        if self._recording.rig.is_blind:
+            return Frame(begin_ns, 0, ())
         if self._further is None:
             return None
         frames = (value for value in self._recording.events(begin_ns) if isinstance(value, Frame))

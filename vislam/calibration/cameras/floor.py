@@ -19,7 +19,7 @@ from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.config import Config, PlanarConfig
 from vislam.core.errors import UsageError
 from vislam.core.messages import Array, Frame, ImuSample, ImuSpan, MagSample, Tracking
-from vislam.core.recording import Recording
+from vislam.core.recording import Recording, with_camera
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.planar import PlanarFrontEnd
 from vislam.imu import ImuBuffer, subtract_bias
@@ -84,7 +84,7 @@ def calibrate_floor(options: FloorOptions) -> Outcome:
             "the floor's flow does not show the height: give --distance-m of a measured drive, or --height-m by tape"
         )
     folder = Folder(options.out, _FILES, options.overwrite)
-    recording = open_source(options.source)
+    recording = with_camera(open_source(options.source))
     found = fit_floor(recording, options)
     statements = _statements(found, recording)
     path = folder.write_text("floor.toml", floor_text(found, statements))

@@ -17,7 +17,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
-from vislam.core.recording import Recording
+from vislam.core.recording import Recording, with_camera
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
 from vislam.runs.sources import open_source
 
@@ -42,7 +42,7 @@ class CameraImuResult:
 def calibrate_camera_imu(options: CameraImuOptions) -> Outcome:
     """Calibrate and write; raises DataError when the motion does not determine rotation or offset."""
     folder = Folder(options.out, _FILES, options.overwrite)
-    recording = open_source(options.source, 0, options.calibration)
+    recording = with_camera(open_source(options.source, 0, options.calibration))
     result = solve_camera_imu(recording, options)
     report = _report(result)
     path = folder.write_text(

@@ -25,7 +25,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
-from vislam.core.recording import Recording
+from vislam.core.recording import Recording, with_camera
 from vislam.datasets.camera_files import CameraCalibration, camchain_text
 from vislam.runs.sources import open_source, recorded_path
 from vislam.vision.depth_focal import FocalFit
@@ -80,7 +80,7 @@ class SelfResult:
 def calibrate_self(options: SelfOptions) -> Outcome:
     """Calibrate and write; raises DataError when the motion does not show the lens."""
     folder = Folder(options.out, _FILES, options.overwrite)
-    result = solve_self(open_source(options.source), options)
+    result = solve_self(with_camera(open_source(options.source)), options)
     report = _report(result, options)
     comment = f"without a board, from {options.source}; focal length to {result.focal_sigma:.2%} (1 sigma)"
     path = folder.write_text("camchain.yaml", camchain_text(_chain(result), comment))

@@ -14,6 +14,7 @@ from vislam.cli.wizard.run_setup import RunSetup
 from vislam.config import Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.recording import with_camera
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.library_cameras import WITH_IMU, gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import open_camera, open_inertial, with_raw_samples
@@ -100,6 +101,8 @@ class _Played:
 
     def __init__(self, uri: str, config: Config, has_images: bool) -> None:
         recording = open_source(uri, config.seed, config.calibration)
+        if has_images:
+            with_camera(recording)
         self._values: Iterator[Value] = iter(recording.events(None if has_images else _NO_FRAMES_NS))
         self._next = next(self._values, None)
         if self._next is None:

@@ -15,7 +15,7 @@ from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
-from vislam.datasets.bags.choice import BagOptions, Choice, ImageFacts, chosen, topics_there
+from vislam.datasets.bags.choice import NONE, BagOptions, Choice, ImageFacts, chosen, topics_there
 from vislam.datasets.bags.decoding import (
     ODOMETRY,
     OLD_TRANSFORMS,
@@ -83,8 +83,10 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
     streams = BagStreams(
         bag, [topic for _, topic in images], None if depth is None else depth[1], (samples[0], samples[1]), by_log_time
     )
-    if not images:
-        found.errors.append(DataError(f"{path} has no camera images that can be read; {topics_there(listing)}"))
+    has_others = any("Image" in entry.topic.type for entry in listing.entries.values()) and options.cam0 != NONE
+    if not images and (choice.imu is None or has_others):
+        go_on = "" if choice.imu is None else "; cam0=none runs without them"
+        found.errors.append(DataError(f"{path} has no camera images that can be read; {topics_there(listing)}{go_on}"))
     noise = None
     if choice.imu is not None:
         noise = _noise(path, choice.imu, found)

@@ -24,7 +24,7 @@ from vislam.datasets.stream import Survey, image_list, with_depth_format
 from vislam.datasets.tables import read_names
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
-LOOKS_FOR = "mav0/cam0/data.csv"
+LOOKS_FOR = "mav0/cam0/data.csv or mav0/imu0/data.csv"
 _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")  # the first gives the body itself; Leica has no attitude
 _KALIBR_FOLDERS = (".", "..", "../dso")  # seen from mav0; TUM-VI keeps them in dso
 _MAX_CAMERAS = 2

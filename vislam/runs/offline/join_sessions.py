@@ -133,7 +133,7 @@ class _Search:
         self._joining: list[tuple[int, int]] = []  # a pair of keyframes for each two submaps that are joined
         self._take_submaps()
         self._graph = parts[0].config.graph
-        self.lever_m = np.ascontiguousarray(parts[0].rig.T_body_cams[0][:3, 3])
+        self.lever_m = np.ascontiguousarray(parts[0].rig.T_body_cam0[:3, 3])
         self._waiting = Waiting(self._graph)
         self._known = self._knowledge([])
         self._placing: list[LoopModel] = []

@@ -65,6 +65,8 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         info = session.info()
         ran = session.config()
         rig = rig_from(info["rig"])
+        if rig.is_blind:
+            raise DataError(f"{run} was run without a camera: there is nothing to make a map of")
         level = stored_level(info)
         placed = _poses(session, run, poses, level.T_level_map)
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is

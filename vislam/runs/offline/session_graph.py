@@ -91,7 +91,7 @@ def read_part(path: Path, name: str) -> SessionPart:
     records = [loop_record(o.edge, len(packets) - 1) for o in memory.graph.loops if o.state.place in _HELD]
     submaps = submaps.joined_by((r.from_id, r.to_id) for r in records)
     odometry = _of_window(memory, config, begins) if memory.graph.windows else _of_chain(log, config)
-    poses, lever_m = memory.graph.T_map_body, log.rig.T_body_cams[0][:3, 3]
+    poses, lever_m = memory.graph.T_map_body, log.rig.T_body_cam0[:3, 3]
     steps = [(k - 1, k) for k in range(1, len(packets))]
     edges = together([edges_of(steps, odometry), loop_edges(records, poses, config.graph, lever_m)])
     return SessionPart(path, name, config, rig, log.rig, memory, log.frames, first_id, submaps, edges)

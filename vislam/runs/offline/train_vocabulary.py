@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import UsageError
 from vislam.core.messages import Frame, ImageU8
+from vislam.core.recording import with_camera
 from vislam.datasets.images import read_any_size
 from vislam.loop import Vocabulary, depth_for, train
 from vislam.runs.sources import open_source
@@ -56,7 +57,7 @@ def _images(source: str, every: int, seed: int) -> Iterator[ImageU8 | None]:
     for path in files[::every]:
         yield read_any_size(path)
     if not files:
-        frames = (event for event in open_source(source, seed).events() if isinstance(event, Frame))
+        frames = (event for event in with_camera(open_source(source, seed)).events() if isinstance(event, Frame))
         for number, frame in enumerate(frames):
             if number % every == 0:
                 yield frame.images[0]

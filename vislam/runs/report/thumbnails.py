@@ -64,7 +64,7 @@ def _of_session(session: Session) -> Thumbnails:
     out = Thumbnails(np.array(stamps, np.int64))
     rig = session.info().get("rig")
     if rig is not None:
-        out.T_body_cam = rig_from(rig).T_body_cams[0]
+        out.T_body_cam = rig_from(rig).T_body_cam0
     left = _MAX_BYTES
     for place in places:
         for i, t_ns, data in session.rows(f"SELECT id, t_ns, colors FROM scans WHERE id = {int(ids[place])}"):

@@ -74,7 +74,7 @@ class RunViewer:
         """Create the file; the rig gives the camera its place and shape in the picture. Raises StorageError."""
         self.path = path
         self._config = config or ViewConfig()
-        self._rig = rig
+        self._rig = None if rig is None or rig.is_blind else rig
         self._stream = rr.RecordingStream("vislam", recording_id=path.parent.name or "run")
         self._stream.set_log_time_enabled(False)  # clocks would make two runs differ
         self._stream.set_log_tick_enabled(False)

@@ -49,7 +49,7 @@ _AT_ONCE = 2000  # poses evaluated in one go
 class PointOptions:
     """What can be chosen about simulated vision; times count from the first frame."""
 
-    rig: Literal["mono", "stereo", "rgbd"] = "stereo"
+    rig: Literal["mono", "stereo", "rgbd", "none"] = "stereo"  # none: no camera
     start_s: _Seconds = 0.0  # into the recording or motion
     duration_s: Annotated[float, Field(ge=0.5)] | None = None  # None: all there is; for point worlds their usual
     camera_hz: Annotated[float, Field(gt=0.1, le=120.0)] = 20.0
@@ -123,10 +123,10 @@ class PointRecording:
         self._set_rigs()
         t_s = self._frame_times()
         lost = np.random.default_rng(loss_seed).random(len(t_s)) < options.lost_share
-        self._frame_s = t_s[~lost]
+        self._frame_s = t_s[~lost] if options.rig != "none" else t_s[:0]
         self.frame_count = len(self._frame_s)
         path = self.motion.at(_steps(self._begin_s, self._end_s, _PATH_STEP_S)).T_world_body
-        cam0 = (path @ self.true_rig.T_body_cams[0])[:, :3, 3]
+        cam0 = (path @ self.true_rig.T_body_cam0)[:, :3, 3]
         self.field = LandmarkField(cam0, np.random.default_rng(np.random.SeedSequence(options.world_seed)))
 
     # -- where motion and inertial data come from --------------------------------------------------------------------
@@ -175,6 +175,9 @@ class PointRecording:
     def _set_rigs(self) -> None:
         base, options = self._base_rig, self.options
         cameras = base.cameras if options.distortion else tuple(_undistorted(camera) for camera in base.cameras)
+        if options.rig == "none":
+            self.true_rig = self.rig = Rig((), ())
+            return
         count = 2 if options.rig == "stereo" else 1
         self.true_rig = Rig(cameras[:count], base.T_body_cams[:count], has_depth=options.rig == "rgbd")
         turn = np.eye(4)
@@ -204,7 +207,7 @@ class PointRecording:
         Tracks depend on what was followed before, so no frame is left out before `from_ns`, unless all are before it.
         """
         streams: list[Iterator[ImuSample | Frame]] = [self._imu.samples()]
-        if from_ns is None or (self._stamps_ns >= from_ns).any():
+        if not self.rig.is_blind and (from_ns is None or (self._stamps_ns >= from_ns).any()):
             streams.append(self._frames())
         yield from heapq.merge(*streams, key=lambda event: event.t_ns)
 
