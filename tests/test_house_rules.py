@@ -24,8 +24,8 @@ MOST_ATTRIBUTES = 20
 LONGEST_FILE, SHORTEST_FILE = 400, 30  # a shorter one that one file alone uses belongs to that one
 
 # Budgets: a commit that raises one says why. They are to fall to what stands beside them.
-BUDGET_PRODUCT_LINES = 114_450  # to 97,000
-BUDGET_TEST_LINES = 60_430  # to 49,000
+BUDGET_PRODUCT_LINES = 114_430  # to 97,000
+BUDGET_TEST_LINES = 60_410  # to 49,000
 BUDGET_LONG_FILES = 13  # to 0
 BUDGET_WORDS = 38_290  # of README and docs/, as `wc -w` counts
 BUDGET_WIDE_FUNCTIONS = 18  # of more than eight arguments; to 0
@@ -34,12 +34,10 @@ BUDGET_PRIVATE_USES = 20  # of attributes with an underscore by tests
 
 # classes beyond the limit and how long they may be, by tens: one state machine each, whose parts share most attributes
 LONG_CLASSES = {
-    "Front": 260,  # the order of a frame, with and without a camera
     "Gy85": 260,  # one board's clock, queue and faults
     "LiveRun": 270,
     "Mapper": 280,  # every product of a map
     "Run": 320,
-    "ReadingIntake": 260,
     "RunViewer": 290,
     "SerialBridge": 300,
     "_Inspector": 270,

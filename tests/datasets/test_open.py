@@ -28,7 +28,9 @@ def test_missing_and_empty_folders_say_what_was_looked_for(tmp_path: Path, name:
 
 def test_folder_of_something_else(tmp_path: Path) -> None:
     (tmp_path / "holiday.txt").write_text("sun")
-    with pytest.raises(DataError, match=r"is no recording that vislam knows: looked for mav0/cam0/data.csv \(euroc\)"):
+    with pytest.raises(
+        DataError, match=r"is no recording that vislam knows: looked for mav0/cam0/data.csv or mav0/imu0"
+    ):
         open_dataset(str(tmp_path))
 
 

@@ -27,7 +27,6 @@ from vislam.sensors import Suite
 from vislam.trajectory.continuity import Continuity, in_odom
 
 _IMU_TIMEOUT_S = 0.1  # without a sample for so long the pose is old: invalid
-# without vision, still inertial data mean rest only below this speed and its sigma
 _NS = 1_000_000_000
 _REST_STEP_NS = 100_000_000  # rest is asked for so often
 _LOOK_NS = 50_000_000  # and the sensors for their health

@@ -70,10 +70,7 @@ class Front:
     def __init__(
         self, config: Config, rig: Rig, noise: ImuNoise | None, clock: StageClock, suite: Suite | None = None
     ) -> None:
-        """Build the stages for a rig; without `noise` there is no IMU and odometry is visual only.
-
-        `suite` are the sensors other than IMU and camera, if there are any.
-        """
+        """Build the stages for a rig; without `noise` there is no IMU; `suite` has those beside IMU and camera."""
         self.config = config = derived(config, rig, noise)
         self.noise = noise
         self.frontend = make_frontend(config.frontend, rig, config.seed)
@@ -81,8 +78,7 @@ class Front:
         self.camera_clock = CameraClock(config.init)
         self.begun = Start(noise is not None)
         self.watch = RunWatch(config.init, self.frontend.knows_scale, rig.is_blind)
-        # without gravity, up is where the first image has it
-        self._T_upright = np.eye(4) if rig.is_blind else _upright(rig)
+        self._T_upright = _upright(rig)
         most_m = np.inf if rig.is_blind else config.ekf.submap_sigma_m  # no loop would join submaps
         self._chain = KeyframeChain(self._T_upright if noise is None else np.eye(4), most_m)
         self.inertial: Inertial | None = None
@@ -238,7 +234,7 @@ class Front:
         state = imu.filtering.ekf.state_at(frame.t_ns)
         if state is None or not self._waypoints.wants(track.vo, track.keyframe is not None):
             return track
-        if not (is_blind or chain.is_bridged(frame.t_ns, imu.buffer.span(chain.t_ns, frame.t_ns), state)):
+        if not is_blind and not chain.is_bridged(frame.t_ns, imu.buffer.span(chain.t_ns, frame.t_ns), state):
             return track
         self.watch.counters["waypoints"] = self.watch.counters.get("waypoints", 0) + 1
         keyframe = unseen_keyframe(chain.id + 1, frame)
@@ -302,8 +298,8 @@ class Front:
 
 
 def _upright(rig: Rig) -> Array:
-    """Return what turns the body [4, 4] so that the first camera's image is upright."""
-    return transform(level_rotation(-rig.T_body_cams[0][:3, 1]), np.zeros(3))
+    """Return what turns the body [4, 4] so that the first image is upright: up, where gravity is not known."""
+    return np.eye(4) if rig.is_blind else transform(level_rotation(-rig.T_body_cams[0][:3, 1]), np.zeros(3))
 
 
 def odometry(front: Front, values: Iterable[ImuSample | MagSample | Reading | Frame]) -> Iterator[FrontStep]:

@@ -66,17 +66,14 @@ class ReadingIntake:
         `accelerometer_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
         `has_window` says that behind keyframes comes a sliding window.
         """
-        became = (
-            "readings", "unusable", "too_early", "dropped", "beginning", "told", "late", "unplaced", "crowded",
-        )  # fmt: skip
+        became = ("readings", "unusable", "too_early", "dropped", "beginning", "told", "late", "unplaced", "crowded")
         self.counters = {name: dict.fromkeys(became, 0) for name in suite.names}
         self.notes: dict[str, str] = {}
         self._suite = suite
         self._of_magnetometer = [name for name in suite.names if suite[name].from_magnetometer]
         self._filter, self._buffer = filtering, buffer
         self._gravity = gravity_m_s2 if buffer is not None else 0.0
-        self._accel_density = accelerometer_noise_density
-        self._has_window = has_window
+        self._accel_density, self._has_window = accelerometer_noise_density, has_window
         self._waiting: deque[Reading] = deque()
         self._beginning = {name: _Beginning() for name in suite.names if suite[name].variables}
         self._starts: list[OwnStart] = []  # for the next keyframe
@@ -126,8 +123,7 @@ class ReadingIntake:
             self.notes.setdefault(reading.sensor, self._suite.why_unusable(reading))
             return
         counts["readings"] += 1
-        reason = self._why_unusable(reading)
-        if reason:
+        if reason := self._why_unusable(reading):
             counts["unusable"] += 1
             self.notes.setdefault(reading.sensor, f"{reason} (at {reading.t_ns} ns)")
             return
@@ -145,8 +141,7 @@ class ReadingIntake:
 
     def give_up_filter(self) -> None:
         """Go on with the path of vision alone: gravity could not be found."""
-        self._filter = self._buffer = None
-        self._gravity = 0.0
+        self._filter, self._buffer, self._gravity = None, None, 0.0
 
     def see(self, t_ns: int, T_odom_body: Array | None) -> None:
         """Take where a frame has the body; without a filter that is all there is to compare readings with."""
