@@ -166,7 +166,7 @@ def tap_above(page):
         "document.getElementById('view-above').addEventListener('click', () => { window.clicked = true; }); }"
     )
     page.locator("#view-above").tap()
-    page.wait_for_function("window.clicked")
+    page.wait_for_function("() => window.clicked")
 
 
 def test_the_map_turns_and_nears_under_fingers_and_a_tap_tells_of_a_loop(chromium, report):
