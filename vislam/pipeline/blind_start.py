@@ -72,8 +72,8 @@ class BlindStart:
         samples = [ImuSample(*row) for row in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True)]
         try:
             state = state_at_rest(samples, self._noise, self._gravity, self._config)
-        except DataError as error:
-            return self._refused("gravity", str(error))
+        except DataError:
+            return self._refused("gravity", f"the last {length_s:.2f} s are not those of rest: keep the body still")
         reason = f"at rest for {length_s:.2f} s"
         return Initialisation("static", reason, state, state, np.eye(4), (state.t_ns,), state.T_world_body[None])
 

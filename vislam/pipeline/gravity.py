@@ -186,7 +186,7 @@ class GravityWait:
             self._early.see(track.vo.t_ns, track.observations, at_rest)
         self._initialiser.time_offset_sigma_s = time_offset_sigma_s
         found = self._initialiser.add(span, track.vo, still_image, track.observations)
-        start.refusal = found.reason
+        start.refusal = found.reason if found.first is None else start.refusal
         self._refused = found if found.first is None else None
         if found.first is None and start.phase is Phase.SEEKING:
             found = self._level(span, track.vo) or found
