@@ -136,3 +136,19 @@ def test_a_pose_graph_given_to_optimize_is_handed_on(tmp_path: Path, capsys: pyt
         assert run_verb([verb, str(path), "--out", str(tmp_path / verb), "--no-report", "--no-certify", "--json"]) == 0
         answers.append(json.loads(capsys.readouterr().out))
     assert answers[0]["poses"] == answers[1]["poses"] == 2
+
+
+def test_a_run_without_a_camera_is_evaluated_and_optimised_and_what_needs_images_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensors, out = tmp_path / "cart.toml", str(tmp_path / "run")
+    sensors.write_text('[sensors.wheels]\nkind = "wheels"\nsimulated_hz = 20.0\n')
+    source = "points:cart-drive,rig=none,duration_s=8"
+    assert run_verb(["run", source, "--sensors.file", str(sensors), "--out", out]) == 0
+    assert run_verb(["optimize", out, "--no-report"]) == 0
+    assert run_verb(["eval", out]) == 0
+    capsys.readouterr()
+    for asked in (["eval", out, "--loops"], ["map", out]):
+        assert run_verb(asked) == 3
+        said = capsys.readouterr().err
+        assert "camera" in said and "Traceback" not in said

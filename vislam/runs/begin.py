@@ -16,7 +16,7 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
-from vislam.core.recording import Recording
+from vislam.core.recording import Recording, with_camera
 from vislam.factors import rig_data
 from vislam.imu import ImuNoise
 from vislam.mapping.semantic.images import LabelFolder
@@ -129,7 +129,7 @@ def _label_names(config: Config, recording: Recording) -> dict[str, Any]:
     folder = config.map.labels.folder
     if folder is None or not config.map.enabled:
         return {}
-    return {"labels": LabelFolder(Path(folder), recording.rig.cameras[0]).classes.data()}
+    return {"labels": LabelFolder(Path(folder), with_camera(recording).rig.cameras[0]).classes.data()}
 
 
 def map_of(

@@ -86,7 +86,7 @@ class _Batch:
         self._suite = suite
         self._config: BatchConfig = config.batch
         self._chain = Chain(log, config.graph, config.machine)
-        self._T_body_cam0 = log.rig.T_body_cams[0]
+        self._T_body_cam0 = log.rig.T_body_cam0
         self._loops = Loops(log.edges, self._chain, config.graph, self._T_body_cam0[:3, 3])
         self._readings = Readings(suite, config.graph)
         for record, keyframe in zip(self._chain.records, log.keyframes, strict=True):

@@ -45,7 +45,7 @@ class Chain:
             raise DataError("the run has no keyframe to optimise; see tracking.csv for why none was taken")
         self._config = config
         self._machine = replace(machine, gravity_m_s2=log.gravity_m_s2)
-        self._lever_m = log.rig.T_body_cams[0][:3, 3]
+        self._lever_m = log.rig.T_body_cam0[:3, 3]
         self.has_imu = log.first_state is not None and log.noise is not None
         first = log.first_state if self.has_imu else None
         self.start = start_record(first, _rigid(log.keyframes[0].T_map_body, "keyframe 0"))

@@ -83,6 +83,9 @@ class _Observed:
 
 
 def _observed(index: int, seen: Observations, rig: Rig, config: FrontEndConfig) -> _Observed:
+    if rig.is_blind:
+        nothing, none = np.zeros(0), np.zeros(0, np.int64)
+        return _Observed(none, none, np.zeros((0, 2)), nothing, nothing, nothing, nothing)
     n = len(seen.track_ids)
     camera = rig.cameras[0]
     xy = camera.normalise(seen.pixels_px)

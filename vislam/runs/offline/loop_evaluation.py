@@ -152,6 +152,8 @@ def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> Tru
     session = Session(session_path)
     try:
         rig = rig_from(session.info()["rig"])
+        if rig.is_blind:
+            raise DataError(f"{session_path}: the run had no camera, so that there are no loops to judge")
         first_id = session.first_id  # the truth of older recordings, in whose map a run begins, is not at hand
         stored = [keyframe for keyframe in session.keyframes() if keyframe.id >= first_id]
     except (KeyError, TypeError, ValueError) as error:
