@@ -12,8 +12,6 @@ from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, no_observations
 from vislam.frontend.result import CommonErrors, TrackResult, lost_motion
 
-NO_CAMERA = "there is no camera"
-
 
 class NoFrontEnd:
     """Answers for every frame that nothing was seen; keyframes come by time alone."""
@@ -39,7 +37,8 @@ class NoFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
     ) -> TrackResult:
         """Return that the frame shows nothing."""
-        return TrackResult(lost_motion(frame.t_ns, self._keyframe_id, True), no_observations(), None, 0.0, NO_CAMERA)
+        lost = lost_motion(frame.t_ns, self._keyframe_id, True)
+        return TrackResult(lost, no_observations(), None, 0.0, "there is no camera")
 
     def begin_at(self, keyframe_id: int, learned: Learned, seeks_place: bool = False) -> None:
         """Take the number that a keyframe would have."""

@@ -319,11 +319,8 @@ def _stretched(state: NavState, T_map_first: Array, scale_sigma: float) -> NavSt
 
 def _variances(record: KeyframeRecord, step: Step) -> tuple[float, float]:
     """Return the variances in rad^2 and m^2 of the motion to a keyframe, by habit across a loss of sight."""
-    if not record.begins_submap:
-        return step.variance_rad2, step.variance_m2
-    if not record.is_tied or record.covariance is None:
-        return _UNKNOWN
-    return float(np.trace(record.covariance[:3, :3])) / 3.0, float(np.trace(record.covariance[3:, 3:])) / 3.0
+    is_unknown = record.begins_submap and not record.is_tied
+    return _UNKNOWN if is_unknown else (step.variance_rad2, step.variance_m2)
 
 
 def _check_odom(record: KeyframeRecord, T_odom_body: Array | None) -> None:

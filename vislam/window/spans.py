@@ -18,7 +18,7 @@ _REINTEGRATE_GYRO_RAD_S = 0.005  # bias change after which first-order correctio
 _REINTEGRATE_ACCEL_M_S2 = 0.05
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSES = 12  # errors of two poses
-_HEAR_AGAIN_RAD, _HEAR_AGAIN_M = 0.002, 0.01  # change of a link to which what was told of it stays linear: of 1 m/s, mm
+_HEAR_AGAIN_RAD, _HEAR_AGAIN_M = 0.002, 0.01  # a link's change within which its readings stay linear: mm at 1 m/s
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
 
 
