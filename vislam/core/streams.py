@@ -58,6 +58,7 @@ class Happening(StrEnum):
     LOOPED = "looped", "played again from its first row, back", "left out"
     APPENDED = "appended", "another log follows, off", "what is behind is left out, and nothing is tied across"
     UNUSABLE = "unusable", "rows that are no measurement", "left out"
+    CONTRADICTING = "contradicting", "another motion than the camera sees", "left out until both agree again"
     CLIPPED = "clipped", "the range ends where the motion does not", "used as they are"
     DARK = "dark", "dark images", "nothing is seen in them"
     BLURRED = "blurred", "images blurred all over", "used as they are"

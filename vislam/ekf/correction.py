@@ -30,19 +30,21 @@ class Correction:
     keyframe_id: int | None  # None: no keyframe
     shows_scale: bool = True  # False: one camera, and motion too uniform; of no use to a loose filter
     noise: SeenNoise | None = None  # since when samples are noisier or calmer; None: as before
+    imu_until_ns: int | None = None  # samples after this time are no information; None: all are
 
     def __reduce__(self) -> tuple[Callable[..., Correction], tuple[Any, ...]]:
         """Travel as plain numbers: dataclasses and arrays by themselves take a third of what the filter then takes."""
         motion = {one.name: _plain(getattr(self.vo, one.name)) for one in fields(VoMeasurement)}
         motion["tracking"] = self.vo.tracking.value
         seen = self.observations if len(self.observations.track_ids) else None
-        others = (self.at_rest, self.on_wheels, self.keyframe_id, self.shows_scale, self.noise)
+        others = (self.at_rest, self.on_wheels, self.keyframe_id, self.shows_scale, self.noise, self.imu_until_ns)
         return _correction, (self.t_ns, motion, seen, *others)
 
     def apply(self, ekf: Ekf | MsckfEkf) -> UpdateResult:
         """Give everything to a filter; return what it made of the motion at once."""
         if self.noise is not None:  # it is of before the frame, and what is replayed once only goes ahead
             ekf.follow_noise(self.noise.t_ns, self.noise.scale)
+        ekf.believe(self.imu_until_ns)
         answer = ekf.correct(self)
         ekf.assume(self.t_ns)  # a frame does not wait for ever: no sample comes
         return answer

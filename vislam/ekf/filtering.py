@@ -90,9 +90,12 @@ class Filtering:
 
     def see(
         self, t_ns: int, vo: VoMeasurement, observations: Observations, at_rest: bool, keyframe_id: int | None,
-        shows_scale: bool, noise: SeenNoise,
+        shows_scale: bool, noise: SeenNoise, imu_until_ns: int | None = None,
     ) -> None:  # fmt: skip
-        """Take what was seen in a frame and what the IMU's noise is, and give the filter what it is to know by now."""
+        """Take what was seen in a frame and what the IMU's noise is, and give the filter what it is to know by now.
+
+        Inertial samples after `imu_until_ns` are no information.
+        """
         if self._config.vision == "none":  # nor that the body rests: a camera has to agree to that
             vo = replace(vo, T_keyframe_body=None, tracking=Tracking.LOST)
             observations, at_rest, keyframe_id = no_observations(), False, None
@@ -100,7 +103,8 @@ class Filtering:
         changed = None
         if noise.scale != self._noise_applied:
             self._noise_applied, changed = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))
-        self._seen.append(Correction(t_ns, vo, observations, at_rest, on_wheels, keyframe_id, shows_scale, changed))
+        others = at_rest, on_wheels, keyframe_id, shows_scale, changed, imu_until_ns
+        self._seen.append(Correction(t_ns, vo, observations, *others))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
         while self._seen and self._seen[0].t_ns <= newest_ns:
             correction = self._seen.popleft()

@@ -37,32 +37,13 @@ class UpdateResult:
     reason: str
 
 
-class Timeline(Generic[S, M]):
-    """Owns the state, its covariance and the last seconds of samples and measurements. One thread only.
+class _Counting(Generic[S, M]):
+    """What came in and what became of it, in numbers."""
 
-    Until it is begun, samples are only kept; a state in the past is then brought to the present through them.
-    """
-
-    def __init__(self, core: Core[S, M], state: S, history_s: float, machine: MachineConfig) -> None:
-        """Set up an uninitialised filter; holes in the samples of more than `max_gap_s` are bridged and counted."""
-        self._core = core
-        self._state = state
-        self._checkpoint_ns = round(_CHECKPOINT_S * _NS)
-        self._history_ns = round(history_s * _NS)
-        self._max_gap_ns, self._gravity_m_s2 = round(machine.max_gap_s * _NS), float(machine.gravity_m_s2)
-        self._series = ImuSeries(10, machine.max_gap_s)  # beside each sample, x[:10] as of the last run through it
-        self._history: History[S, M] | None = None
-        self._t_ns = 0
-        self._known_ns: int | None = None  # of the newest sample that came; later ones are assumed
-        self._applied = 0
-        self._stops_at_event = False  # see `replayed_once`
-        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *core.counters), 0)
-        self._statistics: Statistics = {}  # of events that the history has forgotten
-
-    @property
-    def initialised(self) -> bool:
-        """Whether there is a state."""
-        return self._history is not None
+    _series: ImuSeries
+    _history: History[S, M] | None
+    _counts: dict[str, int]
+    _statistics: Statistics
 
     @property
     def counters(self) -> dict[str, int]:
@@ -80,6 +61,43 @@ class Timeline(Generic[S, M]):
         add_all(sums, [] if self._history is None else self._history.events)
         return sums
 
+    def _refuse(self, counter: str, reason: str) -> UpdateResult:
+        self._counts[counter] += 1
+        return UpdateResult(False, float("nan"), reason)
+
+    def _account(self, outcome: Outcome, sign: int) -> None:
+        for name, number in outcome.counts.items():
+            self._counts[name] += sign * number
+
+
+class Timeline(_Counting[S, M]):
+    """Owns the state, its covariance and the last seconds of samples and measurements. One thread only.
+
+    Until it is begun, samples are only kept; a state in the past is then brought to the present through them.
+    """
+
+    def __init__(self, core: Core[S, M], state: S, history_s: float, machine: MachineConfig) -> None:
+        """Set up an uninitialised filter; holes in the samples of more than `max_gap_s` are bridged and counted."""
+        self._core = core
+        self._state = state
+        self._checkpoint_ns = round(_CHECKPOINT_S * _NS)
+        self._history_ns = round(history_s * _NS)
+        self._max_gap_ns, self._gravity_m_s2 = round(machine.max_gap_s * _NS), float(machine.gravity_m_s2)
+        self._series = ImuSeries(10, machine.max_gap_s)  # beside each sample, x[:10] as of the last run through it
+        self._history: History[S, M] | None = None
+        self._t_ns = 0
+        self._known_ns: int | None = None  # of the newest sample that came; later ones are assumed
+        self._believes = True  # samples, see `believe`
+        self._applied = 0
+        self._stops_at_event = False  # see `replayed_once`
+        self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *core.counters), 0)
+        self._statistics: Statistics = {}  # of events that the history has forgotten
+
+    @property
+    def initialised(self) -> bool:
+        """Whether there is a state."""
+        return self._history is not None
+
     @property
     def dead_reckoning_s(self) -> float:
         """Seconds since vision last corrected the state, or since `initialise`; infinite before."""
@@ -91,6 +109,8 @@ class Timeline(Generic[S, M]):
         Samples that are no measurement of a new time, see `StreamJudge`, are counted and change nothing. What was
         assumed before it, see `assume`, is taken back.
         """
+        if not self._believes:
+            return
         before, history, kept_ns = self._known_ns, self._history, None
         if history is not None and before is not None and before != self._series.newest_t_ns:
             kept_ns = max(before, history.checkpoints[0].t_ns)
@@ -117,6 +137,22 @@ class Timeline(Generic[S, M]):
         if sample.t_ns - history.checkpoints[-1].t_ns >= self._checkpoint_ns:
             self._take_checkpoint()
 
+    def believe(self, until_ns: int | None) -> None:
+        """Go on without the samples after a time, also those that come; None: with those that come from now on.
+
+        Frames then take the filter on, see `assume`.
+        """
+        history, believed, self._believes = self._history, self._believes, until_ns is None
+        if history is None or self._known_ns is None or believed is self._believes:
+            return
+        if until_ns is None:  # what was assumed meanwhile stays
+            self._known_ns = self._series.newest_t_ns
+            return
+        self._series.drop_after(max(until_ns, history.checkpoints[0].t_ns, int(self._series.t_ns[0])))
+        self._known_ns = self._series.newest_t_ns
+        self._restore(history.back_to(self._known_ns or 0))
+        self._run()
+
     def assume(self, t_ns: int) -> None:
         """Go on to a frame that no sample reaches, as unsure as in a hole, and apply what waits.
 
@@ -126,9 +162,15 @@ class Timeline(Generic[S, M]):
         history = self._history
         if self._known_ns is None or history is None:
             return
-        number = self._applied
-        while (event := history.event(number)) is not None and event.t_ns <= t_ns:
-            t_ns, number = max(t_ns, self._core.time_of(event, self._state)), number + 1
+        while (event := history.event(self._applied)) is not None and event.t_ns <= t_ns:
+            number = self._applied
+            self._go_on(self._core.time_of(event, self._state))
+            if self._applied == number:
+                break
+        self._go_on(t_ns)
+
+    def _go_on(self, t_ns: int) -> None:
+        """Go on to a time without samples, and apply what waits until then."""
         if t_ns > (self._series.newest_t_ns or t_ns):
             uniform = _in_uniform_motion(self._state.x, self._gravity_m_s2)
             share = np.exp((self._t_ns - t_ns) / _HABIT_NS)
@@ -179,10 +221,6 @@ class Timeline(Generic[S, M]):
         self._series.extra[:] = np.nan
         self._history = History(self._snapshot(after_event=True), self._core.time_of)
         self._run()
-
-    def _refuse(self, counter: str, reason: str) -> UpdateResult:
-        self._counts[counter] += 1
-        return UpdateResult(False, float("nan"), reason)
 
     def _insert(self, event: Event[M]) -> UpdateResult:
         history = self._history
@@ -253,10 +291,6 @@ class Timeline(Generic[S, M]):
     def _rate_at(self, t_ns: int) -> Array:
         """Return what the gyro showed [3]."""
         return self._series.at(t_ns)[:3] if len(self._series) else np.zeros(3)
-
-    def _account(self, outcome: Outcome, sign: int) -> None:
-        for name, number in outcome.counts.items():
-            self._counts[name] += sign * number
 
     def _checkpoint_at(self, t_ns: int) -> Checkpoint[S] | None:
         return self._history.checkpoint_at(t_ns) if self._history is not None and t_ns <= self._t_ns else None

@@ -60,7 +60,7 @@ class MetricFrontEnd:
     ) -> TrackResult:
         """Place `frame` relative to the last keyframe; see FrontEnd.track."""
         whole, dt_s = self._intake.accept(frame)
-        keyframe = self._life.keyframe
+        keyframe, outliers = self._life.keyframe, 0.0
         if keyframe is None:
             result = self._start(whole, "")
         else:
@@ -69,18 +69,20 @@ class MetricFrontEnd:
             if self._blind is not None:
                 result = self._leave_blindness(self._blind, whole, keyframe, T_guess, dt_s, imu is not None)
             else:
-                attempt = self._place(whole, keyframe, T_guess, dt_s, T_last_now)
+                attempt = self._placer.attempt(self._tracks.view.of(whole), T_guess, dt_s)
+                outliers = 1.0 - attempt.inliers / max(attempt.followed, 1)
+                attempt = self._place(attempt, whole, keyframe, T_guess, dt_s, T_last_now)
                 bias = None if imu is None else gyro_sigma_rad_s
                 result = self._settle(self._tracks.view.of(whole), keyframe, attempt, T_guess, dt_s, bias)
         if self._by_depth is not None:
             self._by_depth.note(result.vo, result.keyframe is not None, result.by_depth, self._tracks.view.T_body_cam)
-        return result.with_scatter(self._noise.sigma_px, 1.0 if frame.tracks is not None else self._noise.over_usual)
+        noise = 1.0 if frame.tracks is not None else self._noise.over_usual
+        return replace(result.with_scatter(self._noise.sigma_px, noise), outliers=outliers)
 
     def _place(
-        self, whole: Frame, keyframe: Keyframe, T_guess: Array, dt_s: float, T_last_now: Array | None
+        self, attempt: Attempt, whole: Frame, keyframe: Keyframe, T_guess: Array, dt_s: float, T_last_now: Array | None
     ) -> Attempt:
-        """Return where the landmarks have a frame: from the guess, by the second camera, or recognised."""
-        attempt = self._placer.attempt(self._tracks.view.of(whole), T_guess, dt_s)
+        """Return where the landmarks have a frame: by an attempt from the guess, the second camera, or recognised."""
         if attempt.failure:
             attempt = self._second.placed(attempt, whole, keyframe, T_guess, dt_s)
         view = self._tracks.view

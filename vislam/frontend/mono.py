@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +142,8 @@ class MonoFrontEnd:
         self._key_xy = self._camera.normalise(self._tracker.pixels)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
-        motion = self._confirmed(self._locate(R_guess, prior, pixels), R_guess, prior, T_last_now)
+        located = self._locate(R_guess, prior, pixels)
+        motion = self._confirmed(located, R_guess, prior, T_last_now)
         if motion.failure:
             self._R_key_cam = R_guess
             return self._lose(frame, motion)
@@ -154,7 +155,8 @@ class MonoFrontEnd:
         self._lost = False
         self._life.placed(frame.t_ns)
         self._learn_noise(motion, given**2)
-        return self._report(frame, motion)
+        outliers = 1.0 - int(located.agreeing.sum()) / max(located.followed, 1)
+        return replace(self._report(frame, motion), outliers=outliers)
 
     @classmethod
     def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:

@@ -16,6 +16,7 @@ from vislam.imu.preintegration import Preintegrated, pose_after, preintegrate
 from vislam.imu.rest import RestDetector, is_slow
 from vislam.imu.resting import state_at_rest
 from vislam.imu.series import ImuSeries, join, shifted, subtract_bias
+from vislam.imu.witness import MotionWitness
 
 __all__ = [
     "AttitudeFilter",
@@ -27,6 +28,7 @@ __all__ = [
     "ImuSeries",
     "InertialCondition",
     "MagCalibration",
+    "MotionWitness",
     "NoiseFloor",
     "NoiseRatios",
     "PowerUp",

@@ -34,6 +34,8 @@ class ImuBuffer:
         self._max_gap_ns = round(machine.max_gap_s * _NS)
         self._samples = 0
         self._forget_at_ns = 0
+        self._disbelieved: list[tuple[int, StreamEvent]] = []  # after which time, and what says so
+        self._believes = True  # now
 
     @property
     def newest_t_ns(self) -> int | None:
@@ -54,13 +56,27 @@ class ImuBuffer:
     @property
     def events(self) -> list[StreamEvent]:
         """What happened in the stream so far."""
-        return self._series.judge.events
+        return [*self._series.judge.events, *(event for _, event in self._disbelieved)]
+
+    def believe(self, until_ns: int | None, since_ns: int) -> None:
+        """Take samples after `until_ns` for no information, None: those that come from now on are some again.
+
+        Since `since_ns` they are seen to contradict other sensors.
+        """
+        if until_ns is not None and self._believes:
+            times = self._series.t_ns[np.searchsorted(self._series.t_ns, since_ns) :]
+            event = StreamEvent(self._series.judge.stream, Happening.CONTRADICTING, since_ns, since_ns, len(times))
+            self._disbelieved.append((until_ns, replace(event, to_ns=int(times[-1]))))
+        self._believes = until_ns is None
 
     def add(self, sample: ImuSample) -> bool:
         """Take a sample; False, and a counter, if it is no measurement or not newer than the last."""
         if not self._series.append(sample):
             return False
         self._samples += 1
+        if not self._believes:
+            after_ns, event = self._disbelieved[-1]
+            self._disbelieved[-1] = after_ns, replace(event, to_ns=sample.t_ns, rows=event.rows + 1)
         if self.noise_floor is not None:
             self.noise_floor.add(sample)
         if sample.t_ns >= self._forget_at_ns:  # now and then: forgetting costs more than taking in
@@ -71,13 +87,17 @@ class ImuBuffer:
     def span(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
         """Return the samples of `[t0_ns, t1_ns]`, first and last interpolated to these times.
 
-        None if the samples held do not cover it, or if t1 is not after t0. A hole in the samples is interpolated
-        across; ask `gap_s` whether there is one before trusting the span.
+        None if the samples held do not cover it, or are not believed, or if t1 is not after t0. A hole in the samples
+        is interpolated across; ask `gap_s` whether there is one before trusting the span.
         """
-        span = self._series.cut(t0_ns, t1_ns)
+        span = self._series.cut(t0_ns, t1_ns) if self._is_believed(t0_ns, t1_ns) else None
         if span is None or self.noise_floor is None:
             return span
         return replace(span, noise=self.noise_floor.between(t0_ns, t1_ns))
+
+    def as_felt(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
+        """Return the samples of `[t0_ns, t1_ns]`, believed or not; None where there is a hole."""
+        return None if self._longest_ns(t0_ns, t1_ns) > self._max_gap_ns else self._series.cut(t0_ns, t1_ns)
 
     def unbroken(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
         """Return `span`, or None, and count it, where a hole in it is longer than `machine.max_gap_s`."""
@@ -89,11 +109,22 @@ class ImuBuffer:
     def gap_s(self, t0_ns: int, t1_ns: int) -> float:
         """Return the longest time between neighbouring samples among those that `[t0_ns, t1_ns]` touches.
 
-        Holes count whole even where the interval ends inside one. Infinite if the samples held do not cover it.
+        Holes count whole even where the interval ends inside one. Infinite if the samples held do not cover it, or are
+        not believed.
         """
+        return self._longest_ns(t0_ns, t1_ns) / _NS if self._is_believed(t0_ns, t1_ns) else float("inf")
+
+    def _longest_ns(self, t0_ns: int, t1_ns: int) -> float:
         times = self._series.t_ns
         if len(times) < 2 or t0_ns < times[0] or t1_ns > times[-1]:
             return float("inf")
         begin = max(int(np.searchsorted(times, t0_ns, side="right")) - 1, 0)
         end = min(int(np.searchsorted(times, t1_ns)) + 1, len(times))
-        return float(np.diff(times[begin:end]).max(initial=0)) / _NS
+        return float(np.diff(times[begin:end]).max(initial=0))
+
+    def _is_believed(self, t0_ns: int, t1_ns: int) -> bool:
+        last = len(self._disbelieved) - 1
+        return not any(
+            after_ns < t1_ns and (t0_ns < event.to_ns or (n == last and not self._believes))
+            for n, (after_ns, event) in enumerate(self._disbelieved)
+        )

@@ -71,7 +71,7 @@ class ImuSeries:
         if after_ns is not None:
             if t_ns <= after_ns:  # too late: what was assumed there stays
                 return False
-            self._end = self._begin + int(np.searchsorted(self.t_ns, after_ns, side="right"))
+            self.drop_after(after_ns)
         self._put(t_ns, six)
         return True
 
@@ -87,6 +87,11 @@ class ImuSeries:
         self._t_ns[self._end] = t_ns
         self._newest_t_ns = t_ns
         self._end += 1
+
+    def drop_after(self, t_ns: int) -> None:
+        """Drop the samples after a time."""
+        self._end = self._begin + int(np.searchsorted(self.t_ns, t_ns, side="right"))
+        self._newest_t_ns = int(self._t_ns[self._end - 1])
 
     def forget_before(self, t_ns: int) -> int:
         """Drop samples not needed to interpolate at or after `t_ns`; return how many went."""

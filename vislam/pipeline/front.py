@@ -157,8 +157,9 @@ class Front:
         with self._clock.measure("track"):
             track = self._track(frame, since)
         still_image, at_rest = (False, False) if imu is None else imu.rests(track, since.span)
-        self.watch.note(track, since.span, since.state, at_rest)
         self._chain.follow(track.vo, at_rest)
+        since = since if imu is None or not self.begun.settled else imu.compare(track, self._chain.T_vo_body, since)
+        self.watch.note(track, since.span, since.state, at_rest)
         offset_sigma_s, ready = self.camera_clock.sigma_s, list[OdometryKeyframe]()
         with self._clock.measure("ekf"):
             if self.gravity is not None:
@@ -259,7 +260,7 @@ class Front:
         """Pack a new keyframe with all that the back end needs of it; return it unless it has to wait for gravity."""
         chain, holds, imu = self._chain, self.begun.holds_keyframes, None
         if self._imu is not None and chain.id >= 0 and not chain.is_torn:
-            imu = self._imu.buffer.span(chain.t_ns, keyframe.t_ns)
+            imu = self._imu.between_keyframes(chain.t_ns, keyframe.t_ns)
         packet = chain.packet(track, keyframe, imu, state, self.camera_clock.applied_s)
         self.watch.counters["submaps"] += packet.begins_submap
         if self.readings is not None and not holds:

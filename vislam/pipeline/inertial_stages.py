@@ -13,7 +13,16 @@ from vislam.ekf.filtering import Filtering
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.stillness import Stillness
-from vislam.imu import ConditionWatch, ImuBuffer, ImuNoise, RestDetector, is_slow, pose_after, subtract_bias
+from vislam.imu import (
+    ConditionWatch,
+    ImuBuffer,
+    ImuNoise,
+    MotionWitness,
+    RestDetector,
+    is_slow,
+    pose_after,
+    subtract_bias,
+)
 from vislam.pipeline.steps import Estimate
 from vislam.sensors import Suite
 
@@ -47,7 +56,7 @@ class Inertial:
         self.condition = ConditionWatch()
         self.filtering = Filtering(config.ekf, noise, config.machine, rig, suite)
         self._rest, self._is_blind = RestDetector(config.init, noise), rig.is_blind
-        self._stillness = Stillness()
+        self._stillness, self._witness = Stillness(), MotionWitness()
         self._is_corrected = config.ekf.vision != "none"
         self._gravity_m_s2, self._bias_walk = config.machine.gravity_m_s2, noise.gyroscope_random_walk
         self._at_frame: NavState | None = None  # the filter's state at the last frame
@@ -65,6 +74,8 @@ class Inertial:
         state = self.filtering.state
         if state is None or last_t_ns is None:
             return Since(span, state, span)
+        if self._witness.doubts:
+            return Since(span, state)  # vision is not to be drawn to what it contradicts
         dt_s, sigmas = (t_ns - last_t_ns) * 1e-9, state.covariance
         is_known = np.sqrt(np.trace(sigmas[6:9, 6:9])) * dt_s <= _KNOWN_MOTION_M
         motion = self.filtering.motion(last_t_ns, t_ns) if is_known else None
@@ -73,6 +84,23 @@ class Inertial:
         sigma_rad_s = float(np.sqrt(np.diag(sigmas)[9:12].max())) + clock.gyro_sigma_rad_s(span)
         unbiased = subtract_bias(span, state.gyro_bias_rad_s, state.accel_bias_m_s2)
         return Since(span, state, unbiased, sigma_rad_s, motion)
+
+    def compare(self, track: TrackResult, T_vo_body: Array, since: Since) -> Since:
+        """Compare what vision saw of a frame with the samples; return what is known of the motion before it by now.
+
+        T_vo_body [4, 4] is where vision has the body.
+        """
+        witness, state = self._witness, since.state
+        if state is None or not self._is_corrected:
+            return since
+        biases = state.gyro_bias_rad_s, state.accel_bias_m_s2
+        witness.see(track.vo, track.outliers, T_vo_body, self.buffer.as_felt, biases)
+        self.buffer.believe(witness.until_ns, witness.since_ns)
+        return since if witness.until_ns is None else Since(None, state)
+
+    def between_keyframes(self, from_ns: int, to_ns: int) -> ImuSpan | None:
+        """Return the samples between two keyframes, if what was seen between them does not contradict them."""
+        return None if self._witness.doubted_ns > from_ns else self.buffer.span(from_ns, to_ns)
 
     def rests(self, track: TrackResult, span: ImuSpan | None) -> tuple[bool, bool]:
         """Return whether the image stood still up to a frame, and whether the body rests by image and samples.
@@ -102,8 +130,8 @@ class Inertial:
         if not ekf.initialised:
             return None, None
         assert floor is not None
-        keyframe_id = None if track.keyframe is None else track.keyframe.id
-        self.filtering.see(t_ns, track.vo, track.observations, at_rest, keyframe_id, shows_scale, floor.now)
+        keyframe_id, until_ns = None if track.keyframe is None else track.keyframe.id, self._witness.until_ns
+        self.filtering.see(t_ns, track.vo, track.observations, at_rest, keyframe_id, shows_scale, floor.now, until_ns)
         after, state = ekf.pose_at(t_ns), ekf.state_at(t_ns)
         if after is None:
             after = T_by_vision

@@ -92,7 +92,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
 
 def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
-    if event.happening in (Happening.STUCK, Happening.UNUSABLE, Happening.HOLE):
+    if event.happening in (Happening.STUCK, Happening.UNUSABLE, Happening.HOLE, Happening.CONTRADICTING):
         return not event.stream.startswith("cam") and _lasted_s(event) > max_gap_s
     return event.tears
 
