@@ -1,6 +1,6 @@
 """Whether inertial samples show the motion that a camera sees: other axes, another unit or another clock do not.
 
-Two things are compared over a quarter of a second, and what is usual in a run says how far apart they may be: by how
+Two things are compared over a quarter of a second, and what is usual in a run sets how far apart they may be: by how
 much the body turned, and, where vision has metres, gravity in vision's frame: what the body's acceleration, as three
 places in a row show it, leaves of the force that the accelerometer felt. That is one vector for as long as vision goes
 on unbroken. Which of the two is wrong shows in the tracks: a camera that follows who walks into its view contradicts
@@ -32,7 +32,7 @@ _FORCE_M_S2, _FORCE_SHARE = 1.0, 0.1  # the same of gravity: a place is off by a
 _UNSEEN_M_S2 = 5.0  # of acceleration in half a second that is not seen, without metres: 2.5 m/s
 _CALM = 3.0  # times the usual difference up to which nothing has begun yet
 _ENOUGH_S = 0.5  # of contradiction more than of agreement, for samples not to be believed ...
-_MOST_WEIGHT = 4.0  # ... where they are off by no more than they may be; one by more counts so many times at most
+_MOST_WEIGHT = 4.0  # ... where they are off by no more than they may be; one by more counts at most that many times
 _MOST_S = 2.0  # of agreement, for them to be believed again
 _VOTE_S = 0.1  # that one frame counts at most
 _LATELY_NS = _NS  # in which tracks have to agree as ever before samples are doubted
