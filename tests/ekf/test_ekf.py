@@ -524,6 +524,31 @@ def test_what_a_hole_was_filled_with_is_taken_back_when_samples_come_late(scene:
     assert_same(late.state(), on_time.state())
 
 
+def test_a_filter_that_believes_samples_no_more_is_as_one_that_never_got_them(scene: Scene) -> None:
+    """They are taken back to where they went wrong; frames since then count as if each had waited in vain."""
+    good = [s for s in scene.samples if s.t_ns <= T0_NS + 2 * NS]
+    bad = [ImuSample(s.t_ns, -s.gyro_rad_s, -s.accel_m_s2) for s in scene.samples[len(good) : 500]]
+    misled, spared = scene.ekf(), scene.ekf()
+    frames = [i for i, t_ns in enumerate(scene.stamps) if t_ns < bad[-1].t_ns]
+    for s in [*good, *bad]:
+        misled.predict(s)
+    for s in good:
+        spared.predict(s)
+    for i in frames:
+        scene.measure(misled, i)
+        scene.measure(spared, i)
+        spared.assume(scene.stamps[i])
+    misled.believe(good[-1].t_ns)
+    misled.assume(scene.stamps[frames[-1]])
+    assert_same(misled.state(), spared.state())
+    misled.predict(scene.samples[500])
+    assert_same(misled.state(), spared.state())
+    misled.believe(None)
+    for s in scene.samples[501:600]:
+        misled.predict(s)
+    assert misled.state().t_ns == scene.samples[599].t_ns
+
+
 def test_samples_older_than_what_is_remembered_do_not_come_between(scene: Scene) -> None:
     ekf = scene.ekf(history_s=0.5)
     known = [s for s in scene.samples if s.t_ns <= T0_NS + NS]

@@ -13,7 +13,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.geometry import invert, se3_adjoint, se3_exp, se3_log
 from vislam.core.messages import Array, Bools, ImuSpan
 from vislam.frontend.view import DepthReading
-from vislam.imu.gyro_turns import integrate_gyro
+from vislam.imu.gyro_turns import gyro_rotation
 from vislam.vision.refine import PoseEstimate
 
 DEGRADED_INLIERS = 40  # fewer: degraded
@@ -21,12 +21,6 @@ _MIN_INLIER_RATIO = 0.3  # of the followed tracks; below, the agreement may be c
 DEGRADED_INLIER_RATIO = 0.5  # of the followed tracks
 _CONTRADICTING_SHARE = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
 _MIN_EXPECTED_SHARE = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
-
-
-def gyro_rotation(span: ImuSpan) -> Array:
-    """Return R_first_last [3, 3] of the body over a span, by trapezoidal integration of the angular rate."""
-    t_s = (span.t_ns - span.t_ns[0]).astype(np.float64) * 1e-9
-    return np.asarray(integrate_gyro(t_s, np.ascontiguousarray(span.gyro_rad_s))[-1])
 
 
 class MotionPredictor:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vislam.core.geometry import so3_exp, so3_log
 from vislam.core.jit import njit
-from vislam.core.messages import Array
+from vislam.core.messages import Array, ImuSpan
 from vislam.core.small import product, product_back, product_transposed
 
 UNKNOWNS = 8  # of `turn_errors`: offset, gyro bias, rotation of the camera, drift
@@ -46,6 +46,12 @@ def integrate_gyro(t_s: Array, gyro: Array) -> Array:
         step = so3_exp(0.5 * (gyro[i - 1] + gyro[i]) * (t_s[i] - t_s[i - 1]))
         out[i] = out[i - 1] @ step
     return out
+
+
+def gyro_rotation(span: ImuSpan) -> Array:
+    """Return R_first_last [3, 3] of the body over a span, by trapezoidal integration of the angular rate."""
+    t_s = (span.t_ns - span.t_ns[0]).astype(np.float64) * 1e-9
+    return np.asarray(integrate_gyro(t_s, np.ascontiguousarray(span.gyro_rad_s))[-1])
 
 
 @njit(cache=True, nogil=True)

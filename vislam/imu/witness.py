@@ -16,9 +16,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from vislam.core.geometry import so3_exp, so3_log
+from vislam.core.geometry import interpolate, so3_log
 from vislam.core.messages import Array, ImuSpan, Tracking, VoMeasurement
-from vislam.imu.gyro_turns import integrate_gyro
+from vislam.imu.gyro_turns import gyro_rotation
 from vislam.imu.series import subtract_bias
 
 _NS = 1_000_000_000
@@ -117,9 +117,8 @@ class MotionWitness:
                 self._frames = [_Seen(vo.t_ns, T_vo_body, np.eye(3), np.zeros(3))]
                 return
             span = subtract_bias(span, *biases)
-            R_gyro = integrate_gyro((span.t_ns - last.t_ns) / _NS, span.gyro_rad_s)[-1]
-            force = _halfway(last.T_vo_body, T_vo_body) @ span.accel_m_s2.mean(axis=0)
-            self._frames.append(_Seen(vo.t_ns, T_vo_body, R_gyro, force))
+            force = interpolate(last.T_vo_body, T_vo_body, 0.5)[:3, :3] @ span.accel_m_s2.mean(axis=0)
+            self._frames.append(_Seen(vo.t_ns, T_vo_body, gyro_rotation(span), force))
             self._compare(vo.has_scale)
 
     @property
@@ -199,12 +198,6 @@ def _slide(window: deque[tuple[int, float]], t_ns: int, value: float, length_ns:
 def _before(frames: Sequence[_Seen], k: int) -> int:
     """Return the newest frame that is long enough before frame `k`; -1: there is none."""
     return next((i for i in range(k - 1, -1, -1) if frames[k].t_ns - frames[i].t_ns >= _BASE_NS), -1)
-
-
-def _halfway(T_a: Array, T_b: Array) -> Array:
-    """Return the rotation [3, 3] in the middle between two poses [4, 4]."""
-    R_a, R_b = T_a[:3, :3], T_b[:3, :3]
-    return np.asarray(R_a @ so3_exp(0.5 * so3_log(np.ascontiguousarray(R_a.T @ R_b))))
 
 
 def _turns(frames: Sequence[_Seen]) -> tuple[float, float]:

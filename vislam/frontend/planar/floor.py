@@ -17,7 +17,7 @@ from vislam.core.camera import Camera
 from vislam.core.errors import UsageError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, ImageU8, ImuSpan
-from vislam.frontend.attempt import gyro_rotation
+from vislam.imu.gyro_turns import gyro_rotation
 from vislam.vision.features import detect_corners, detect_harris, noise_grey
 
 _TEXTURE_RATIO = 4.0  # of a corner's response to that of image noise alone; below, it is noise
