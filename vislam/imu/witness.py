@@ -18,6 +18,7 @@ import numpy as np
 
 from vislam.core.geometry import interpolate, so3_log
 from vislam.core.messages import Array, ImuSpan, Tracking, VoMeasurement
+from vislam.core.quantiles import median
 from vislam.imu.gyro_turns import gyro_rotation
 from vislam.imu.series import subtract_bias
 
@@ -62,7 +63,7 @@ class Outliers:
         if is_usual:
             self._usual.append(share)
         _slide(self._shares, t_ns, share, _BASE_NS)
-        _slide(self._means, t_ns, float(np.mean([one for _, one in self._shares])), _LATELY_NS)
+        _slide(self._means, t_ns, sum(one for _, one in self._shares) / len(self._shares), _LATELY_NS)
 
     @property
     def were_few(self) -> bool:
@@ -135,15 +136,15 @@ class MotionWitness:
         self._frames, middle, first = self._frames[max(first, 0) :], middle - max(first, 0), min(first, 0)
         off_rad, turn_rad = _turns(self._frames[middle:])
         may_rad = _TURN_RAD if is_metric else _MISTAKEN * _TURN_RAD
-        off = self._off(off_rad, self._turns_rad, may_rad + _TURN_SHARE * turn_rad)
-        tells, is_calm = turn_rad > 2.0 * _TURN_RAD, self._is_calm(off_rad, self._turns_rad)
+        off, is_calm = self._off(off_rad, self._turns_rad, may_rad + _TURN_SHARE * turn_rad)
+        tells = turn_rad > 2.0 * _TURN_RAD
         if first == 0:
             gravity, own_m_s2 = _gravity(self._frames, middle) if is_metric else (_mean_gravity(self._frames), 0.0)
             if self._gravity:
                 off_m_s2 = float(np.linalg.norm(gravity - np.median(self._gravity, axis=0)))
-                is_calm = is_calm and self._is_calm(off_m_s2, self._forces_m_s2)
                 may_m_s2 = _FORCE_M_S2 + _FORCE_SHARE * own_m_s2 if is_metric else _UNSEEN_M_S2
-                off, tells = max(off, self._off(off_m_s2, self._forces_m_s2, may_m_s2)), True
+                by_force, is_force_calm = self._off(off_m_s2, self._forces_m_s2, may_m_s2)
+                off, is_calm, tells = max(off, by_force), is_calm and is_force_calm, True
             if off <= 1.0 and self.until_ns is None:
                 self._gravity.append(gravity)
         if is_calm:
@@ -153,15 +154,16 @@ class MotionWitness:
         else:
             self._contradict(min(off, _MOST_WEIGHT))
 
-    def _off(self, off: float, usual: deque[float], least: float) -> float:
-        """Return a difference over what it may be, above 1 where it is not usual; take note of it where it is."""
-        ratio = off / max(_UNUSUAL * float(np.median(usual)), least) if len(usual) >= _FEWEST else 0.0
+    def _off(self, off: float, usual: deque[float], least: float) -> tuple[float, bool]:
+        """Return a difference over what it may be, above 1 where it is not usual, and whether nothing has begun yet.
+
+        One that is usual is taken note of.
+        """
+        middle = median(np.array(usual)) if usual else np.inf
+        ratio = off / max(_UNUSUAL * middle, least) if len(usual) >= _FEWEST else 0.0
         if ratio <= 1.0 and self.until_ns is None:
             usual.append(off)
-        return ratio
-
-    def _is_calm(self, off: float, usual: deque[float]) -> bool:
-        return not usual or off <= _CALM * float(np.median(usual))
+        return ratio, off <= _CALM * middle
 
     @property
     def _vote_s(self) -> float:
