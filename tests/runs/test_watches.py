@@ -79,7 +79,7 @@ def feed(frames, at_rest=False):
     watch = CameraFeed()
     for t_ns, image in frames:
         watch.add(Frame(t_ns, 0, () if image is None else (image,)))
-        watch.moved(at_rest)
+        watch.moved(at_rest, are_two=False)
     return watch
 
 

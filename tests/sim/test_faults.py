@@ -81,7 +81,8 @@ BY_TIMES = [
     (fault, event)
     for fault, known in BREAKS.items()
     for event in known.named
-    if event.startswith(("imu0", "cam0")) and not event.endswith(("?", "dark", "repeated", "blurred", "clipped"))
+    if event.startswith(("imu0", "cam0"))
+    and not event.endswith(("?", "dark", "repeated", "blurred", "clipped", "moving"))
 ]
 
 

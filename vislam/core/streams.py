@@ -21,7 +21,7 @@ _MEDIAN_OF = 31  # intervals, whose median is the usual one
 _AT_FIRST = (3, 7, 15)  # of the first ones, too
 _HOLE = 2.5  # usual intervals
 _NEARLY_TOGETHER = 0.25  # of the usual interval
-_FEWEST = 3  # that make a burst, or a pattern in a window of intervals
+_FEWEST = 3  # that make a burst, a pattern in a window of intervals, or a motion in images
 _ALIKE = 0.05  # of the usual interval: intervals of one length
 _UNEVEN = 0.25  # of the usual interval: differences of stamps that are worth a word
 _OFF = 0.1  # of a stated rate
@@ -61,6 +61,7 @@ class Happening(StrEnum):
     CLIPPED = "clipped", "the range ends where the motion does not", "used as they are"
     DARK = "dark", "dark images", "nothing is seen in them"
     BLURRED = "blurred", "images blurred all over", "used as they are"
+    MOVING = "moving", "something moves by itself before the camera", "what moves as the room did before is followed"
 
     def __new__(cls, name: str, words: str = "", done: str = "") -> Self:
         """Make the member of a name."""
@@ -175,7 +176,9 @@ class StreamJudge:
         known = self._events
         if (pause := self._pace.pending) is not None:
             known = known | {pause[0]: _joined(known.get(pause[0], []), StreamEvent(self.stream, *pause))}
-        return sorted((e for some in known.values() for e in some), key=lambda e: (e.from_ns, e.happening))
+        all_known = (e for some in known.values() for e in some)
+        told = (e for e in all_known if e.happening is not Happening.MOVING or e.rows >= _FEWEST)
+        return sorted(told, key=lambda e: (e.from_ns, e.happening))
 
     @property
     def steps_ns(self) -> list[int]:

@@ -139,8 +139,10 @@ class CameraFeed:
             self.judge.look(frame.images[0], frame.t_ns, frame.t_ns)
         self._last, self._last_depth_m = small, depth_m
 
-    def moved(self, at_rest: bool) -> None:
-        """Say whether the body rested over the newest frame."""
+    def moved(self, at_rest: bool, are_two: bool) -> None:
+        """Say whether the body rested over the newest frame, and whether tracks show two motions in it."""
+        if are_two and self._last_t_ns is not None:
+            self.judge.note(Happening.MOVING, self._last_t_ns, self._last_t_ns)
         if self._same and not at_rest and self._last_t_ns is not None:
             self.repeated += 1
             self.frozen += self.is_frozen

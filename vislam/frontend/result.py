@@ -29,6 +29,7 @@ class TrackResult:
     reason: str  # why tracking is not ok, or why the frame became a keyframe; empty otherwise
     sigma_px: float = float("nan")  # of a track's pixel, as this run showed it up to now; told until enough was seen
     by_depth: bool = False  # vision failed, and the depth image alone places the frame
+    others: int = 0  # tracks that agree on another motion than the frame's: something moves by itself
 
     def with_scatter(self, sigma_px: float, noise: float) -> TrackResult:
         """Return the result with what the run shows of its tracks; `noise` as in `Observations`."""

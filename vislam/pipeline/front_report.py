@@ -153,7 +153,7 @@ class RunWatch:
             state: the filter's before the frame.
             at_rest: whether the body rested over it.
         """
-        self.feed.moved(at_rest)
+        self.feed.moved(at_rest, track.others > 0)
         self.tracks.add(track.sigma_px, track.observations)
         if not self._knows_scale:
             self.uniform.add(span, state, at_rest)

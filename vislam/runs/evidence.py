@@ -73,6 +73,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         gravity_m_s2=machine.gravity_m_s2,
         max_gap_s=machine.max_gap_s,
         events=tuple(_together([e for e in report.events if _matters(e, machine.max_gap_s)], report.first_t_ns)),
+        moving=tuple(_together([e for e in report.events if e.happening is Happening.MOVING], report.first_t_ns)),
         causes=tuple(_together([e for e in report.events if _may_explain(e)], report.first_t_ns)),
         **_calibration(report.calibration),
     )

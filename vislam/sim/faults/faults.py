@@ -195,7 +195,7 @@ _THROUGHOUT: Mapping[str, Fault] = {
 
 # what begins at some moment
 BREAKS: Mapping[str, Fault] = {
-    "person": Fault("a person over half of the image", _IMAGES, cam.person, _ON),
+    "person": Fault("a person over half of the image", _IMAGES, cam.person, _ON, ("cam0 moving",)),
     **{f"imu hole {s}": Fault(f"no inertial sample for {s} s", _IMU, gone(ImuSample), (s, s), ("imu0 hole",), _ANY)
        for s in (0.3, 1.0, 3.0)},
     "camera hole 0.3": Fault("no frame for 0.3 s", _ANY, gone(Frame), (0.3, 0.3), ("cam0 hole",), _IMU),
