@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.core.streams import Happening, StreamJudge, together
+from vislam.core.streams import Happening, Repeats, StreamJudge, is_dark, together
 
 STEP_NS = 5_000_000
 MOST = (10.0,) * 6
@@ -259,6 +259,28 @@ def test_images_out_of_focus_are_named_and_those_blurred_by_motion_or_for_a_mome
     assert shown(200, range(80, 90)).events == []
     assert shown(200, range(0), motion_px=25).events == []
     assert shown(200, range(200)).events == []  # nobody knows it otherwise
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (240, 320)])
+def test_an_image_of_noise_alone_is_dark_whatever_its_brightness_and_one_through_a_lens_is_not(shape) -> None:
+    rng, (v, u) = np.random.default_rng(4), np.mgrid[: shape[0], : shape[1]]
+    scene = cv2.GaussianBlur(rng.normal(0.0, 60.0, shape), (0, 0), 0.7)
+    for mean, sigma in ((40.0, 2.0), (120.0, 12.0), (250.0, 0.0)):
+        noise = sigma * rng.standard_normal(shape)
+        uneven = 0.02 * u + 0.03 * v
+        assert is_dark(np.clip(mean + uneven + noise, 0, 255).astype(np.uint8)) == (sigma > 0.0)
+        assert is_dark(np.clip(mean + noise, 0, 255).astype(np.uint8))
+        faint = 0.5 * sigma / scene.std() * scene  # half of the noise
+        assert sigma == 0.0 or not is_dark(np.clip(mean + faint + noise, 0, 255).astype(np.uint8))
+    assert is_dark(rng.integers(0, 3, shape, dtype=np.uint8))
+
+
+def test_images_that_repeat_are_told_by_their_pixels_and_depth_without_a_measurement_is_equal_to_itself() -> None:
+    rng, repeats = np.random.default_rng(4), Repeats()
+    depth = rng.uniform(1.0, 3.0, (48, 64)).astype(np.float32)
+    depth[::16] = np.nan
+    assert [repeats.take(image) for image in (depth, depth.copy(), depth + 1.0, depth + 1.0)] == [False, True] * 2
+    assert repeats.row == 1 and repeats.changed == 0.5
 
 
 def test_what_happened_goes_to_another_process_and_back() -> None:

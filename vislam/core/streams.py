@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from vislam.core.messages import ImageU8
+from vislam.core.messages import ImageF32, ImageU8
 
 _NS = 1_000_000_000
 _MEDIAN_OF = 31  # intervals, whose median is the usual one
@@ -34,6 +34,8 @@ _TOGETHER_NS = _NS // 2  # what happens again so soon is the same event
 _CHANGES = 100  # pairs of neighbours that differ, after which equal ones are a surprise
 _BY_CHANCE = 1e-6  # runs of equal rows as long that a whole stream has by chance
 _DARK = 3.0  # mean grey, and as much of its scatter, below which an image shows nothing
+# correlation of neighbours that noise has, at most, and in sigmas of it; a lens makes it 0.75
+_NOISY, _BY_NOISE = 0.05, 5.0
 _STEP_ROWS = 5  # in order among each other, behind what came before: the clock stepped; fewer are rows that came late
 
 
@@ -59,7 +61,7 @@ class Happening(StrEnum):
     APPENDED = "appended", "another log follows, off", "what is behind is left out, and nothing is tied across"
     UNUSABLE = "unusable", "rows that are no measurement", "left out"
     CLIPPED = "clipped", "the range ends where the motion does not", "used as they are"
-    DARK = "dark", "dark images", "nothing is seen in them"
+    DARK = "dark", "dark or blank images", "nothing is seen in them"
     BLURRED = "blurred", "images blurred all over", "used as they are"
     MOVING = "moving", "something moves by itself before the camera", "what moves as the room did before is followed"
 
@@ -110,8 +112,41 @@ class StreamEvent:
 
 
 def is_dark(image: ImageU8) -> bool:
-    """Return whether an image [H, W] shows nothing."""
-    return bool(image.mean() < _DARK and image.std() < _DARK)
+    """Return whether an image [H, W] shows nothing: it is black, or even but for the noise of its pixels.
+
+    A lens makes neighbours alike, which noise does not; how brightness changes over the image is taken out.
+    """
+    if image.mean() < _DARK and image.std() < _DARK:
+        return True
+    rows = image[::_EVERY_PX].astype(np.float32)
+    fine = rows[:, _EVERY_PX:] - rows[:, :-_EVERY_PX]
+    fine -= fine.mean() if fine.size else 0.0
+    alike = float(np.sum(fine[:, 1:] * fine[:, :-1]))
+    return alike <= max(_NOISY, _BY_NOISE / max(fine.size, 1) ** 0.5) * float(np.sum(fine * fine))
+
+
+class Repeats:
+    """Tells whether images, of colour or depth, are the one before again, to the last bit: one pixel in 8, each way.
+
+    Attributes:
+        row: so many in a row, up to now, equal the one before.
+        changed: share of the pixels that differ, in the newest that did not.
+    """
+
+    def __init__(self) -> None:
+        """Begin before the first image."""
+        self.row, self.changed = 0, 0.0
+        self._last: ImageU8 | ImageF32 | None = None
+
+    def take(self, image: ImageU8 | ImageF32) -> bool:
+        """Take the next image [H, W]; return whether it is the one before again."""
+        small, last = image[::_EVERY_PX, ::_EVERY_PX].copy(), self._last
+        self._last = small
+        if last is None or last.shape != small.shape:
+            return False
+        changed = float(np.mean((small != last) & ~(np.isnan(small) & np.isnan(last))))
+        self.row, self.changed = (0, changed) if changed else (self.row + 1, self.changed)
+        return not changed
 
 
 def together(events: Iterable[StreamEvent], recorded: Collection[StreamJudge]) -> list[StreamEvent]:
@@ -220,21 +255,22 @@ class StreamJudge:
             self._pace.see(newest, t_ns)
         return True
 
-    def look(self, image: ImageU8, from_ns: int, to_ns: int) -> None:
-        """Look at an image [H, W], which stands for those of a stretch of time: whether it is dark or blurred."""
+    def look(self, image: ImageU8, from_ns: int, to_ns: int) -> bool:
+        """Look at an image [H, W], which stands for those of a stretch of time; return whether it shows nothing."""
         if is_dark(image):
-            return self.note(Happening.DARK, from_ns, to_ns)
+            self.note(Happening.DARK, from_ns, to_ns)
+            return True
         sharp = _sharpness(image)
         if len(self._sharp) < _STEP_ROWS or sharp > _BLURRED * float(np.median(self._sharp)):
             self._sharp.append(sharp)
             self._blur = 0, 0, 0
-            return None
+            return False
         since_ns, images, noted = self._blur if self._blur[1] else (from_ns, 0, 0)
         if images + 1 >= _STEP_ROWS and to_ns - since_ns >= _NS:
             self.note(Happening.BLURRED, since_ns, to_ns, images + 1 - noted)
             noted = images + 1
         self._blur = since_ns, images + 1, noted
-        return None
+        return False
 
     def correct(self, t_ns: int) -> None:
         """Take the stamp of the newest row for a wrong one, which had leapt ahead: a row at `t_ns` is in its place."""

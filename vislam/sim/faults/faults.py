@@ -234,8 +234,8 @@ BREAKS: Mapping[str, Fault] = {
         ("imu0 ?",), _SCALE),
     "now in g": Fault("the IMU comes back with another unit", _IMU, imu.IN_G, _ON, ("imu0 ?",), _SCALE),
     "black": Fault("black images", _IMAGES, cam.BLACK, _LONG, ("cam0 dark",)),
-    "white": Fault("white images", _IMAGES, cam.WHITE, _LONG, ("cam0 ?",)),
-    "covered": Fault("a hand on the lens", _IMAGES, cam.COVERED, _LONG, ("cam0 ?",)),
+    "white": Fault("white images", _IMAGES, cam.WHITE, _LONG, ("cam0 dark",)),
+    "covered": Fault("a hand on the lens", _IMAGES, cam.COVERED, _LONG, ("cam0 dark",)),
     "frozen": Fault("the same image again and again", _IMAGES, held(Frame, cam.as_before), _LONG, ("cam0 repeated",)),
     "now and then": Fault("one image in ten repeats the one before", _IMAGES, cam.HICCUPS, _ON, (), _ANY),
     "salt": Fault("5 % of the pixels are salt and pepper", _IMAGES, cam.SALTED, _ON),
@@ -248,7 +248,7 @@ BREAKS: Mapping[str, Fault] = {
         frame, images=(frame.images[0], *first.images[1:]))), _LONG, ("cam1 repeated",), _IMU),
     "one gone": Fault("one camera of two sends nothing", _PAIR, cam.ONE_GONE, _LONG, ("cam1 hole",), _IMU),
     "crossed": Fault("left and right are exchanged", _needs("stereo"), cam.SWAPPED, _ON, ("cam0 ?",)),
-    "no depth": Fault("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, ("depth0 ?",)),
+    "no depth": Fault("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, ("depth0 dark",)),
     "frozen depth": Fault("the same depth image again and again", _RGBD, held(
         Frame, lambda first, frame: replace(frame, depth_m=first.depth_m)), _LONG, ("depth0 repeated",)),
 }  # fmt: skip
