@@ -40,7 +40,7 @@ from vislam.hw.library_cameras import gives_frames, open_frame_camera, open_with
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.imu.series import MOST
+from vislam.imu.series import AXES
 from vislam.runs.camera_rig import rig_of
 from vislam.runs.recorded_readings import FurtherPorts, ReadingRecorder
 
@@ -190,7 +190,7 @@ class _Recording:
         self._is_stopping = threading.Event()
         self._images_ended = threading.Event()
         rate_hz = 0.0 if inertial is None else inertial.rate_hz
-        self._judges = {"imu0": StreamJudge("imu0", MOST, rate_hz=rate_hz), "cam0": StreamJudge("cam0")}
+        self._judges = {"imu0": StreamJudge("imu0", AXES, rate_hz=rate_hz), "cam0": StreamJudge("cam0")}
         self._first_ns, self._repeats = recorded.began_ns, Repeats()
         self._began_utc = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
@@ -226,8 +226,10 @@ class _Recording:
             if self._readings is not None:
                 recorded.notes += self._readings.notes()
             events = [event for judge in self._judges.values() for event in judge.events]
-            recorded.events = [event.entry(self._first_ns, _done(event)) for event in events]
-            recorded.notes += tuple(event.words(self._first_ns, _done(event)) for event in events[:_NAMED_EVENTS])
+            recorded.events = [replace(event, done=_done(event)).entry(self._first_ns) for event in events]
+            recorded.notes += tuple(
+                replace(event, done=_done(event)).words(self._first_ns) for event in events[:_NAMED_EVENTS]
+            )
         except StorageError as error:
             recorded.ended = str(error)
             with suppress(StorageError, OSError):  # what went wrong first is what is reported

@@ -218,7 +218,7 @@ BREAKS: Mapping[str, Fault] = {
     "stuck": Fault("one inertial sample again and again", _IMU, held(
         ImuSample, lambda first, row: replace(first, t_ns=row.t_ns)), _ON, ("imu0 stuck",), _SCALE),
     "axis stuck": Fault("the gyro's z axis repeats one value", _IMU, held(ImuSample, lambda first, row: replace(
-        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, ("imu0 ?",), _SCALE),
+        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, ("imu0 stuck",), _SCALE),
     "twice": Fault("half of the inertial rows come twice", _IMU, imu.TWICE, _LONG, ("imu0 duplicate",), _ANY),
     "repeated": Fault("every other sample is the one before", _IMU, imu.TWINS, _LONG, (), _SCALE),
     "disordered": Fault("one inertial row in fifty is late", _IMU, imu.DISORDERED, _ON, ("imu0 late",), _ANY),
@@ -229,7 +229,7 @@ BREAKS: Mapping[str, Fault] = {
     "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, ("imu0 clipped",), _SCALE),
     "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY, _ON),
     "vibration": Fault("the vibration of a propeller, aliased", _IMU, imu.SHAKEN, _ON),
-    "spikes": Fault("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, ("imu0 ?",), _SCALE),
+    "spikes": Fault("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, ("imu0 spike",), _SCALE),
     "reconnected": Fault("the IMU comes back with two axes turned", _IMU, imu.scaled(-1, -1, 1, -1, -1, 1), _ON,
         ("imu0 ?",), _SCALE),
     "now in g": Fault("the IMU comes back with another unit", _IMU, imu.IN_G, _ON, ("imu0 ?",), _SCALE),
