@@ -109,7 +109,7 @@ def test_a_second_camera_and_depth_that_fail_alone_are_named_and_black_from_then
         watch.moved(False, are_two=False)
     told = {(e.stream, str(e.happening)): e for e in watch.events}
     assert set(told) == {("cam1", "repeated"), ("depth0", "repeated"), ("depth0", "dark")}
-    assert told["cam1", "repeated"].from_ns == 21 * 50_000_000
+    assert told["cam1", "repeated"].from_ns == 20 * 50_000_000
     assert told["depth0", "repeated"].from_ns == 19 * 50_000_000
     assert [bool(frame.images[1].any()) for frame in seen] == [k < 22 for k in range(60)]
     assert all(frame.images[0].any() for frame in seen)

@@ -18,7 +18,7 @@ class Axis(NamedTuple):
 
 
 class Run:
-    """Tells values that equal more before them than chance explains, by how often neighbours were equal up to now.
+    """Finds values that equal more before them than chance explains, by how often neighbours were equal up to now.
 
     Attributes:
         last: the newest value.
@@ -46,7 +46,7 @@ class Run:
         return self.is_stuck
 
     def is_surprise(self, share: float) -> bool:
-        """Whether so many equal ones are none of chance, where at least a share of neighbours is equal by it."""
+        """Whether the equal ones are too many for chance, where at least a share of neighbours is equal by it."""
         pairs = self.changes + self._equal
         return bool(pairs * max((self._equal + 1.0) / (pairs + 1.0), share) ** self.length < _BY_CHANCE)
 

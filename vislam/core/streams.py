@@ -131,10 +131,10 @@ def is_dark(image: ImageU8) -> bool:
 
 
 class Repeats:
-    """Tells whether images, of colour or depth, are the one before again, to the last bit: one pixel in 8, each way.
+    """Finds images, of colour or depth, that are the one before again, to the last bit: one pixel in 8, each way.
 
     Attributes:
-        row: so many in a row, up to now, equal the one before.
+        row: how many in a row, up to now, equal the one before.
         changed: share of the pixels that differ, in the newest that did not.
     """
 

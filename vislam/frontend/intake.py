@@ -102,6 +102,7 @@ class CameraFeed:
         self.first_t_ns: int | None = None
         self._judges = {"cam0": StreamJudge("cam0", hole_s=_HOLE_S)}
         self._repeats: dict[str, Repeats] = {}
+        self._before_ns: int | None = None
         self._last_t_ns: int | None = None
         self._depth_ns = 0  # of the newest depth image that was another one than before
 
@@ -126,7 +127,7 @@ class CameraFeed:
         usual_ns = self._judges["cam0"].usual_ns
         if self._last_t_ns is not None and usual_ns:
             self.missing += max(round((frame.t_ns - self._last_t_ns) / usual_ns) - 1, 0)
-        self._last_t_ns = frame.t_ns
+        self._before_ns, self._last_t_ns = self._last_t_ns, frame.t_ns
         images = tuple(self._seen(f"cam{k}", image) for k, image in enumerate(frame.images))
         if not images:
             self._judges["cam0"].takes(frame.t_ns)
@@ -151,7 +152,7 @@ class CameraFeed:
             return
         for name, repeats in self._repeats.items():
             if repeats.row and name != "depth0":
-                self._judges[name].note(Happening.REPEATED, t_ns, t_ns)
+                self._judges[name].note(Happening.REPEATED, self._before_ns or t_ns, t_ns)
         if self._is_depth_old:
             self._judges["depth0"].note(Happening.REPEATED, self._depth_ns, t_ns)
         if "cam0" in self._repeats and self._repeats["cam0"].row:

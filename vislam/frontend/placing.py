@@ -25,7 +25,7 @@ _USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is assumed: 
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
 _WITH_THE_ROOM = 0.8  # of the tracks that agreed in the keyframe, at least, where a frame moves with it
-_OTHERS, _OTHERS_AGREE = 0.1, 0.7  # of the tracks that agree, and of the others: so many move as one rigid thing
+_OTHERS, _OTHERS_AGREE = 0.1, 0.7  # least shares, of those that agree and of the others: they move as one rigid thing
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
 

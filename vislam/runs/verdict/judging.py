@@ -148,7 +148,7 @@ def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
         )
     if e.frames_repeated >= _REPEATED_FRAMES:
         yield f"{e.frames_repeated} images repeat the one before while the body moves: the camera's driver is stuck"
-    if e.moving and not e.has_imu:  # which an IMU tells from the body's own motion
+    if e.moving and not e.has_imu:  # an IMU would know the motion of the body
         more = f", and {len(e.moving) - 1} times more" if len(e.moving) > 1 else ""
         yield f"{e.moving[0]}{more}: do not trust the way since then, and keep the camera off what moves"
     if e.submaps_apart:
