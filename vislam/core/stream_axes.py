@@ -58,7 +58,7 @@ class AxisWatch:
         """Take the axes; without any, nothing is asked of rows."""
         self.axes = axes
         self._runs = [Run() for _ in axes]
-        self._others = [[0] * len(axes) for _ in axes]  # changes of all, when the newest value of an axis came
+        self._others = [[0] * len(axes) for _ in axes]  # changes of all, when the value of an axis came again
         self._low, self._high = [float("inf")] * len(axes), [-float("inf")] * len(axes)
 
     def are_possible(self, row: Sequence[float]) -> bool:
@@ -77,7 +77,7 @@ class AxisWatch:
         for k, (run, value) in enumerate(zip(self._runs, row, strict=False)):
             run.take(t_ns, value)
             self._low[k], self._high[k] = min(self._low[k], value), max(self._high[k], value)
-            if run.length == 0:
+            if run.length == 1:
                 self._others[k] = [other.changes for other in self._runs]
         return [
             (self.axes[k].name, run.since_ns)
