@@ -36,6 +36,7 @@ from vislam.sim.faults.faults import BREAKS, FAULTS, FaultyRecording
 _WRONG = 3.0  # times the clean error
 _SPARED = 1.5  # times the clean error, where what is left suffices
 _NAMED_S = 0.1
+_SELDOM = ("person", "clipped", "spikes")  # show only now and then: named from the first time on that they do
 _FROM, _TO = 0.35, 0.75  # of the length, between which moments are
 _CLEAN = "clean"
 _UNIFORM = "uniform"  # a motion of its own, not a fault of sensors
@@ -164,8 +165,9 @@ def judged_again(entry: dict[str, Any]) -> dict[str, Any]:
 def is_named(entry: dict[str, Any]) -> bool:
     """Whether each event that a fault is stands among those of a run, at its time."""
     within_s = max(_NAMED_S, entry["interval_s"])
-    there = [event for event in entry["events"] if abs(event["from_s"] - entry["from_s"]) <= within_s]
-    kinds = {f"{event['stream']} {kind}" for event in there for kind in (event["happening"], "?")}
+    late_s = math.inf if entry["fault"] in _SELDOM else within_s
+    there = [event for event in entry["events"] if -within_s <= event["from_s"] - entry["from_s"] <= late_s]
+    kinds = {f"{event['stream'].split()[0]} {kind}" for event in there for kind in (event["happening"], "?")}
     return entry["fault"] not in FAULTS or kinds.issuperset(FAULTS[entry["fault"]].named)
 
 

@@ -11,14 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vislam.core.streams import Happening, StreamJudge, together
+from vislam.core.stream_axes import Axis
+from vislam.core.streams import Happening, Repeats, StreamJudge, is_dark, together
 
 STEP_NS = 5_000_000
-MOST = (10.0,) * 6
+AXES = [Axis(name, 10.0, 1e3) for name in ("a x", "a y", "a z", "b x", "b y", "b z")]
 
 
 def fed(rows: list[tuple[int, list[float]]]) -> tuple[StreamJudge, list[bool]]:
-    judge = StreamJudge("imu0", MOST, 0.1)
+    judge = StreamJudge("imu0", AXES, 0.1)
     return judge, [judge.takes(t_ns, row) for t_ns, row in rows]
 
 
@@ -48,6 +49,44 @@ def test_a_stuck_sensor_is_named_from_its_first_repetition_and_refused_until_it_
     assert not any(taken[2010:2600])
     assert all(taken[2600:])
     assert judge.refused["stuck"] == event.rows >= 590
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.2])
+def test_an_axis_that_is_stuck_alone_is_named_and_one_that_rests_or_is_cut_off_with_others_is_not(
+    resolution: float,
+) -> None:
+    rows = stream(3000, resolution)
+    held = [
+        (t, [*row[:2], rows[1999][1][2], *row[3:]]) if 2000 <= k < 2600 else (t, row) for k, (t, row) in enumerate(rows)
+    ]
+    judge, taken = fed(held)
+    (event,) = judge.events
+    assert (event.happening, event.stream, event.to_ns) == (Happening.STUCK, "imu0 a z", 2599 * STEP_NS)
+    assert abs(event.from_ns - 1999 * STEP_NS) <= STEP_NS
+    assert not any(taken[2020:2600]) and all(taken[2600:]) and judge.refused["stuck"] == event.rows
+    rests = stream(3000, resolution, 1.0)[:2000] + stream(3000, resolution, 0.5 * resolution)[2000:]
+    cut_off = [
+        (t, [*row[:2], min(row[2], 0.4), *row[3:]]) if k >= 2000 else (t, row) for k, (t, row) in enumerate(rows)
+    ]
+    high = [(t, [*row[:2], 9.0, *row[3:]]) if k >= 2000 else (t, row) for k, (t, row) in enumerate(rows)]
+    assert fed(rests if resolution else rows)[0].events == fed(high)[0].events == []
+    assert [e.stream for e in fed(cut_off)[0].events] == []
+
+
+def test_single_rows_far_off_are_left_out_and_named_and_a_motion_that_goes_on_is_taken() -> None:
+    axes = [axis._replace(most=1e3, leap=100.0) for axis in AXES]
+    rows, far = stream(1000), {200: 150.0, 400: 150.0, 401: -150.0, 999: 150.0}
+    rows = [(t_ns, [far.get(k, row[0]), *row[1:]]) for k, (t_ns, row) in enumerate(rows)]
+    judge = StreamJudge("imu0", axes, 0.1)
+    taken = [judge.takes(t_ns, row) for t_ns, row in rows]
+    assert [k for k, is_taken in enumerate(taken) if not is_taken] == list(far)
+    assert [(e.happening, e.from_ns // STEP_NS, e.rows) for e in judge.events] == [
+        (Happening.SPIKE, 200, 1),
+        (Happening.SPIKE, 400, 2),
+    ]
+    judge, shift = StreamJudge("imu0", axes, 0.1), 300.0
+    moved = [judge.takes(t_ns, [row[0] + shift * (k >= 500), *row[1:]]) for k, (t_ns, row) in enumerate(stream(1000))]
+    assert [k for k, is_taken in enumerate(moved) if not is_taken] == [500] and judge.events == []
 
 
 def test_holes_are_told_by_the_rate_of_the_stream_itself() -> None:
@@ -87,7 +126,7 @@ def test_what_is_no_number_or_beyond_any_sensor_is_no_measurement() -> None:
 
 
 def test_a_stream_of_nothing_but_events_stays_small() -> None:
-    judge = StreamJudge("imu0", MOST, 0.1)
+    judge = StreamJudge("imu0", AXES, 0.1)
     for k in range(400):
         judge.takes(k * 1_000_000_000, [np.nan] * 6)
     assert len(judge.events) <= 50
@@ -220,6 +259,23 @@ def test_playback_that_begins_again_is_told_from_a_clock_that_steps_back_and_fro
     assert kinds(judged([*times, times[-1] + 30_000_000_000], [*rows, rows[0]], 0.1)) == [("hole", 4.995, 34.995)]
 
 
+def test_it_is_said_that_a_clock_which_steps_back_alone_ends_the_use_of_inertial_data() -> None:
+    times, cut = ticks(1000), 600
+    back = [*times[:cut], *(t - 1_000_000_000 for t in times[cut:])]
+
+    def done(**streams: list[int]) -> dict[str, str]:
+        judges = []
+        for name, stamps in streams.items():
+            judges.append(StreamJudge(name, recorded=True))
+            for t_ns in stamps:
+                judges[-1].takes(t_ns)
+        return {e.stream: e.entry(0)["done"] for e in together([], judges) if e.happening is Happening.STEP_BACK}
+
+    assert done(imu0=back, cam0=times)["imu0"].startswith("no sample is used from then on")
+    assert "inertial samples are used no more" in done(imu0=times, cam0=back)["cam0"]
+    assert set(done(imu0=back, cam0=back).values()) == set(done(imu0=back).values()) == {Happening.STEP_BACK.done}
+
+
 def test_a_hole_is_a_step_forth_where_the_stream_ends_later_than_another_by_as_much() -> None:
     names = ("imu0", "cam0")
 
@@ -259,6 +315,28 @@ def test_images_out_of_focus_are_named_and_those_blurred_by_motion_or_for_a_mome
     assert shown(200, range(80, 90)).events == []
     assert shown(200, range(0), motion_px=25).events == []
     assert shown(200, range(200)).events == []  # nobody knows it otherwise
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (240, 320)])
+def test_an_image_of_noise_alone_is_dark_whatever_its_brightness_and_one_through_a_lens_is_not(shape) -> None:
+    rng, (v, u) = np.random.default_rng(4), np.mgrid[: shape[0], : shape[1]]
+    scene = cv2.GaussianBlur(rng.normal(0.0, 60.0, shape), (0, 0), 0.7)
+    for mean, sigma in ((40.0, 2.0), (120.0, 12.0), (250.0, 0.0)):
+        noise = sigma * rng.standard_normal(shape)
+        uneven = 0.02 * u + 0.03 * v
+        assert is_dark(np.clip(mean + uneven + noise, 0, 255).astype(np.uint8)) == (sigma > 0.0)
+        assert is_dark(np.clip(mean + noise, 0, 255).astype(np.uint8))
+        faint = 0.5 * sigma / scene.std() * scene  # half of the noise
+        assert sigma == 0.0 or not is_dark(np.clip(mean + faint + noise, 0, 255).astype(np.uint8))
+    assert is_dark(rng.integers(0, 3, shape, dtype=np.uint8))
+
+
+def test_images_that_repeat_are_told_by_their_pixels_and_depth_without_a_measurement_is_equal_to_itself() -> None:
+    rng, repeats = np.random.default_rng(4), Repeats()
+    depth = rng.uniform(1.0, 3.0, (48, 64)).astype(np.float32)
+    depth[::16] = np.nan
+    assert [repeats.take(image) for image in (depth, depth.copy(), depth + 1.0, depth + 1.0)] == [False, True] * 2
+    assert repeats.row == 1 and repeats.changed == 0.5
 
 
 def test_what_happened_goes_to_another_process_and_back() -> None:

@@ -93,7 +93,7 @@ def test_stuck_samples_and_frozen_and_dark_images_are_named_with_their_times(tmp
     result = inspect(str(tmp_path))
     assert told(result, "warning", "imu0: stuck at one value from 1.50 to 2.00 s")
     assert told(result, "warning", "cam0: images that equal the one before from 0.50 to 0.95 s (10)")
-    assert told(result, "warning", "cam0: dark images from 2.00 to 2.50 s (10)")
+    assert told(result, "warning", "cam0: dark or blank images from 2.00 to 2.50 s (10)")
 
 
 def written(root: Path, rows: list[tuple[float, list[float]]]) -> Path:

@@ -71,6 +71,43 @@ def test_motions_are_as_sure_as_tracks_scatter(rig: str, pixel_sigma_px: float) 
     assert len(nees) > 250 and ((mean > 0.5) & (mean < 2.0)).all()
 
 
+def beside_a_walker(recording: PointRecording, since: int) -> Iterator[Frame]:
+    """Yield frames of which, from one on, two in three tracks are of a body that goes to and fro before the camera."""
+    frames, camera = (event for event in recording.events() if isinstance(event, Frame)), recording.true_rig.cameras[0]
+    rng = np.random.default_rng(1)
+    cloth_m = np.column_stack([rng.uniform(-0.4, 0.4, (140, 2)), rng.uniform(1.9, 2.1, 140)])
+    for k, frame in enumerate(frames):
+        given = frame.tracks
+        assert given is not None and given.depth_m is not None
+        seen_m = (cloth_m + np.array([0.4 * np.sin(0.1 * (k - since)), 0.0, 0.0]))[: 140 * (k >= since)]
+        pixels = camera.project(seen_m) + 0.3 * rng.standard_normal((len(seen_m), 2))
+        ids = 1_000_000 + 1000 * (k // 8) + np.arange(len(seen_m))  # cloth turns: tracks end, others begin
+        yield replace(frame, tracks=Observations(
+            np.concatenate([given.track_ids[:70], ids]), np.vstack([given.pixels_px[:70], pixels]),
+            depth_m=np.concatenate([given.depth_m[:70], seen_m[:, 2]]),
+        ))  # fmt: skip
+
+
+def test_what_walks_before_the_camera_does_not_lead_it_away_though_most_new_tracks_are_its_own() -> None:
+    recording = open_points("handheld-room", seed=1, rig="rgbd", duration_s=8.0)
+    since = 60
+    frontend, keyframes = make_frontend(CONFIG, recording.rig, 0), dict[int, Array]()
+    T_true = recording.true_states(recording.frame_times_ns).T_world_body
+    others, errors_m = [], []
+    for frame, T in zip(beside_a_walker(recording, since), T_true, strict=True):
+        result = frontend.track(frame, None)
+        others.append(result.others)
+        if result.vo.T_keyframe_body is not None and result.vo.keyframe_id in keyframes:
+            error = invert(invert(keyframes[result.vo.keyframe_id]) @ T) @ result.vo.T_keyframe_body
+            errors_m.append(np.linalg.norm(error[:3, 3]))
+        if result.keyframe is not None:
+            keyframes[result.keyframe.id] = T
+    two, mean_m, most_m = np.array(others) > 0, np.mean(errors_m[since:]), np.max(errors_m)
+    print(f"two motions in {two.sum()} frames; errors of {1e3 * mean_m:.0f} mm, {1e3 * most_m:.0f} mm at most")
+    assert not two[:since].any() and two[since:].sum() >= 10
+    assert len(errors_m) > 140 and mean_m < 0.03 and most_m < 0.1  # most tracks followed: 71 and 263 mm
+
+
 def test_mono_odometry_tells_turns_and_directions() -> None:
     recording = open_points("laps", seed=1, rig="mono", duration_s=15.0)
     lever = recording.true_rig.T_body_cams[0]

@@ -23,7 +23,7 @@ def sample(t_ns: int, value: float = 0.0) -> ImuSample:
 def filled(rate_hz: float = 100.0, duration_s: float = 2.0, **config: float) -> ImuBuffer:
     buffer = ImuBuffer(ImuConfig(**config), MachineConfig())
     for k in range(round(duration_s * rate_hz) + 1):
-        assert buffer.add(sample(T0_NS + round(k * NS / rate_hz), float(k % 500)))
+        assert buffer.add(sample(T0_NS + round(k * NS / rate_hz), float(k % 5 if duration_s > 5.0 else k)))
     return buffer
 
 
@@ -62,7 +62,15 @@ def test_bad_samples_are_refused_and_counted() -> None:
     assert not buffer.add(ImuSample(T0_NS + NS, np.array([0.0, np.nan, 0.0]), np.zeros(3)))
     assert not buffer.add(ImuSample(T0_NS + NS, np.zeros(3), np.array([0.0, np.inf, 0.0])))
     assert buffer.newest_t_ns == T0_NS + 100_000_000
-    assert buffer.counters == {"samples": 11, "unusable": 2, "late": 1, "duplicate": 1, "stuck": 0, "gaps": 0}
+    assert buffer.counters == {
+        "samples": 11,
+        "unusable": 2,
+        "late": 1,
+        "duplicate": 1,
+        "stuck": 0,
+        "spike": 0,
+        "gaps": 0,
+    }
 
 
 def test_history_is_bounded() -> None:

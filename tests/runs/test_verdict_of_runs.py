@@ -1,6 +1,7 @@
 """Faults put into a recording end in a verdict that names them; what is sound is trusted. Metrics, report and print."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -15,6 +16,7 @@ from vislam.runs.evidence import front_evidence
 from vislam.runs.folder import prepare
 from vislam.runs.report import write_report
 from vislam.runs.sources import open_source
+from vislam.runs.verdict import judge
 from vislam.sim.faults.faults import FAULTS, FaultyRecording
 
 _URI = "points:laps,rig=stereo,duration_s=12,camera_hz=10,tracks=80"
@@ -114,6 +116,16 @@ def test_a_hole_is_a_doubt_of_the_imu_and_a_cause_of_the_camera():
     assert found("cam0", 0.9).causes == found("imu0", 5.0).causes == ()
     assert "imu0: rows are missing from 2.00 to 2.20 s" in found("imu0", 0.2).events[0]
     assert "cam0: rows are missing from 2.00 to 3.10 s" in found("cam0", 1.1).causes[0]
+
+
+def test_what_moves_by_itself_is_a_doubt_without_an_imu_and_a_cause_beside_one():
+    def verdict(**known):
+        moves = StreamEvent("cam0", Happening.MOVING, 2_000_000_000, 4_000_000_000, 30)
+        return judge(replace(evidence_of(events=(moves,)), frames=100, **known), Config().verdict)
+
+    assert "moves by itself before the camera from 2.00 to 4.00 s" in verdict(has_imu=False).reasons[0]
+    assert verdict(has_imu=True).state == "trusted"
+    assert "moves by itself" in verdict(has_imu=True, frames_lost=20).reasons[0]
 
 
 def test_dark_images_are_not_those_of_a_stuck_driver():

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -79,7 +80,7 @@ def feed(frames, at_rest=False):
     watch = CameraFeed()
     for t_ns, image in frames:
         watch.add(Frame(t_ns, 0, () if image is None else (image,)))
-        watch.moved(at_rest)
+        watch.moved(at_rest, are_two=False)
     return watch
 
 
@@ -95,6 +96,24 @@ def test_images_that_repeat_while_the_body_moves_are_counted():
     assert feed([(k * 50_000_000, im) for k, im in enumerate(stuck)]).repeated == 20
     assert feed([(k * 50_000_000, im) for k, im in enumerate(stuck)], at_rest=True).repeated == 0
     assert feed([(k * 50_000_000, im) for k, im in enumerate(seen)]).repeated == 0
+
+
+def test_a_second_camera_and_depth_that_fail_alone_are_named_and_black_from_then_on():
+    clear = [np.repeat(np.repeat(im, 4, 0), 4, 1) for im in images(80)]
+    depths = [im.astype(np.float32) for im in images(80, seed=2)]
+    watch, seen = CameraFeed(), []
+    for k in range(60):
+        right = clear[79] if k >= 20 else clear[60 - k]
+        depth = depths[19] if 19 <= k < 40 else np.zeros_like(depths[0]) if k >= 40 else depths[k]
+        seen.append(watch.add(Frame(k * 50_000_000, k, (clear[k], right), depth_m=cv2.resize(depth, (256, 192)))))
+        watch.moved(False, are_two=False)
+    told = {(e.stream, str(e.happening)): e for e in watch.events}
+    assert set(told) == {("cam1", "repeated"), ("depth0", "repeated"), ("depth0", "dark")}
+    assert told["cam1", "repeated"].from_ns == 20 * 50_000_000
+    assert told["depth0", "repeated"].from_ns == 19 * 50_000_000
+    assert [bool(frame.images[1].any()) for frame in seen] == [k < 22 for k in range(60)]
+    assert all(frame.images[0].any() for frame in seen)
+    assert [k for k, frame in enumerate(seen) if not frame.depth_m.any()] == list(range(30, 60))
 
 
 def test_images_that_are_stuck_are_told_from_hiccups_and_from_rest():

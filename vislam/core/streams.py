@@ -14,14 +14,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from vislam.core.messages import ImageU8
+from vislam.core.messages import ImageF32, ImageU8
+from vislam.core.stream_axes import Axis, AxisWatch, Run
 
 _NS = 1_000_000_000
 _MEDIAN_OF = 31  # intervals, whose median is the usual one
 _AT_FIRST = (3, 7, 15)  # of the first ones, too
 _HOLE = 2.5  # usual intervals
 _NEARLY_TOGETHER = 0.25  # of the usual interval
-_FEWEST = 3  # that make a burst, or a pattern in a window of intervals
+_FEWEST = 3  # that make a burst, a pattern in a window of intervals, or a motion in images
 _ALIKE = 0.05  # of the usual interval: intervals of one length
 _UNEVEN = 0.25  # of the usual interval: differences of stamps that are worth a word
 _OFF = 0.1  # of a stated rate
@@ -31,9 +32,9 @@ _BLURRED = 0.5  # of the usual sharpness, for a second: longer than a turn blurs
 _SHARP_OF = 101  # images, whose median sharpness is the usual one
 _MOST_EVENTS = 50  # of one kind; what comes later is counted with the last
 _TOGETHER_NS = _NS // 2  # what happens again so soon is the same event
-_CHANGES = 100  # pairs of neighbours that differ, after which equal ones are a surprise
-_BY_CHANCE = 1e-6  # runs of equal rows as long that a whole stream has by chance
 _DARK = 3.0  # mean grey, and as much of its scatter, below which an image shows nothing
+# correlation of neighbours that noise has, at most, and in sigmas of it; a lens makes it 0.75
+_NOISY, _BY_NOISE = 0.05, 5.0
 _STEP_ROWS = 5  # in order among each other, behind what came before: the clock stepped; fewer are rows that came late
 
 
@@ -58,10 +59,12 @@ class Happening(StrEnum):
     LOOPED = "looped", "played again from its first row, back", "left out"
     APPENDED = "appended", "another log follows, off", "what is behind is left out, and nothing is tied across"
     UNUSABLE = "unusable", "rows that are no measurement", "left out"
+    SPIKE = "spike", "single rows far off those around them", "left out"
     CONTRADICTING = "contradicting", "another motion than the camera sees", "left out until both agree again"
     CLIPPED = "clipped", "the range ends where the motion does not", "used as they are"
-    DARK = "dark", "dark images", "nothing is seen in them"
+    DARK = "dark", "dark or blank images", "nothing is seen in them"
     BLURRED = "blurred", "images blurred all over", "used as they are"
+    MOVING = "moving", "something moves by itself before the camera", "what moves as the room did before is followed"
 
     def __new__(cls, name: str, words: str = "", done: str = "") -> Self:
         """Make the member of a name."""
@@ -70,6 +73,10 @@ class Happening(StrEnum):
         return made
 
 
+_ALONE = {
+    "imu0": "no sample is used from then on: which of their times are the camera's is not known",
+    "cam0": "left out until it has caught up; inertial samples are used no more, for their times are not the camera's",
+}
 _TEARING = (Happening.STEP_BACK, Happening.LOOPED, Happening.APPENDED)
 _OF_STAMPS = (Happening.BURST, Happening.SAWTOOTH, Happening.WRONG_RATE, Happening.APPENDED)
 
@@ -87,31 +94,72 @@ class StreamEvent:
     from_ns: int
     to_ns: int
     rows: int
+    done: str = ""  # about it, if not the usual
 
     @property
     def tears(self) -> bool:
         """Whether it parts what came before from what came after by an unknown time."""
         return self.happening in _TEARING
 
-    def entry(self, begin_ns: int, done: str = "") -> dict[str, Any]:
-        """Return it for a JSON file, in seconds since `begin_ns`; `done` is what was done, if not the usual."""
+    def entry(self, begin_ns: int) -> dict[str, Any]:
+        """Return it for a JSON file, in seconds since `begin_ns`."""
         return {
             "stream": self.stream, "happening": self.happening, "from_s": (self.from_ns - begin_ns) / _NS,
-            "to_s": (self.to_ns - begin_ns) / _NS, "rows": self.rows, "done": done or self.happening.done,
+            "to_s": (self.to_ns - begin_ns) / _NS, "rows": self.rows, "done": self.done or self.happening.done,
         }  # fmt: skip
 
-    def words(self, begin_ns: int, done: str = "") -> str:
+    def words(self, begin_ns: int) -> str:
         """Return it as a sentence without the full stop, see `entry`."""
         begin_s, end_s = (self.from_ns - begin_ns) / _NS, (self.to_ns - begin_ns) / _NS
         when = f"from {begin_s:.2f} to {end_s:.2f} s"
         if self.tears or self.happening is Happening.STEP_FORTH:
             when = f"by {abs(begin_s - end_s):.2f} s at {begin_s:.2f} s"
-        return f"{self.stream}: {self.happening.words} {when} ({self.rows}); {done or self.happening.done}"
+        return f"{self.stream}: {self.happening.words} {when} ({self.rows}); {self.done or self.happening.done}"
 
 
 def is_dark(image: ImageU8) -> bool:
-    """Return whether an image [H, W] shows nothing."""
-    return bool(image.mean() < _DARK and image.std() < _DARK)
+    """Return whether an image [H, W] shows nothing: it is black, or even but for the noise of its pixels.
+
+    A lens makes neighbours alike, which noise does not; how brightness changes over the image is taken out.
+    """
+    if image.mean() < _DARK and image.std() < _DARK:
+        return True
+    rows = image[::_EVERY_PX].astype(np.float32)
+    fine = rows[:, _EVERY_PX:] - rows[:, :-_EVERY_PX]
+    fine -= fine.mean() if fine.size else 0.0
+    alike = float(np.sum(fine[:, 1:] * fine[:, :-1]))
+    return alike <= max(_NOISY, _BY_NOISE / max(fine.size, 1) ** 0.5) * float(np.sum(fine * fine))
+
+
+class Repeats:
+    """Finds images, of colour or depth, that are the one before again, to the last bit: one pixel in 8, each way.
+
+    Attributes:
+        row: how many in a row, up to now, equal the one before.
+        changed: share of the pixels that differ, in the newest that did not.
+    """
+
+    def __init__(self) -> None:
+        """Begin before the first image."""
+        self.row, self.changed = 0, 0.0
+        self._last: ImageU8 | ImageF32 | None = None
+
+    def take(self, image: ImageU8 | ImageF32) -> bool:
+        """Take the next image [H, W]; return whether it is the one before again."""
+        small, last = image[::_EVERY_PX, ::_EVERY_PX].copy(), self._last
+        self._last = small
+        if last is None or last.shape != small.shape:
+            return False
+        changed = float(np.mean((small != last) & ~(np.isnan(small) & np.isnan(last))))
+        self.row, self.changed = (0, changed) if changed else (self.row + 1, self.changed)
+        return not changed
+
+
+def _is_alone(step: StreamEvent, events: Iterable[StreamEvent]) -> bool:
+    """Whether the clock of IMU or camera stepped, and the other's did not."""
+    others = {"imu0", "cam0"} - {step.stream}
+    near = (e for e in events if e.tears and e.stream in others)
+    return len(others) == 1 and not any(abs(e.from_ns - step.from_ns) <= _TOGETHER_NS for e in near)
 
 
 def together(events: Iterable[StreamEvent], recorded: Collection[StreamJudge]) -> list[StreamEvent]:
@@ -136,6 +184,8 @@ def together(events: Iterable[StreamEvent], recorded: Collection[StreamJudge]) -
             ]
             if any(abs(late_ns - end) <= _OFF * (hole.to_ns - hole.from_ns) for end in ends_ns):
                 known[k] = replace(hole, happening=Happening.STEP_FORTH)
+        elif hole.happening is Happening.STEP_BACK and {"imu0", "cam0"} <= spans.keys() and _is_alone(hole, known):
+            known[k] = replace(hole, done=_ALONE[hole.stream])
     return sorted(dict.fromkeys(known), key=lambda event: event.from_ns)
 
 
@@ -148,23 +198,24 @@ class StreamJudge:
     """
 
     def __init__(
-        self, stream: str, most: Sequence[float] = (), hole_s: float = 0.0, rate_hz: float = 0.0, recorded: bool = False
+        self, stream: str, axes: Sequence[Axis] = (), hole_s: float = 0.0, rate_hz: float = 0.0, recorded: bool = False
     ) -> None:
         """Begin with no row; a stream that is `recorded` may be several logs in one.
 
-        `most` are limits of the numbers of a row, `rate_hz` is the stated rate, holes below `hole_s` are none.
+        `axes` are the numbers of a row, `rate_hz` is the stated rate, holes below `hole_s` are none.
         """
-        kinds = (Happening.UNUSABLE, Happening.DUPLICATE, Happening.LATE, Happening.STUCK)
+        kinds = (Happening.UNUSABLE, Happening.DUPLICATE, Happening.LATE, Happening.STUCK, Happening.SPIKE)
         self.refused: dict[str, int] = dict.fromkeys(map(str, kinds), 0)
-        self.stream, self._most = stream, most
+        self.stream = stream
         self._newest_ns: int | None = None
         self._first: list[tuple[int, Sequence[float]]] = []  # rows with their times, that begin a loop again
         self._is_refused = False  # what came since then, so that a hole behind it has a name already
         self._behind: list[tuple[int, Sequence[float]]] = []  # rows behind the newest, as far as they rise
         self._step = Happening.STEP_BACK  # what they are, when they are many
-        self._last: Sequence[float] = ()
-        self._run, self._run_ns, self._is_stuck = 0, 0, False  # rows equal to the one before them, and since when
-        self._pairs, self._equal = 0, 0  # of neighbours, those that were stuck left out
+        self._rows, self._axes = Run(), AxisWatch(axes)
+        self._of_axes: dict[str, list[StreamEvent]] = {}  # what happened to one alone, by its name
+        self._taken: Sequence[float] = ()  # the newest row that was
+        self._leapt: tuple[int, Sequence[float]] | None = None  # the one after it, as long as none says why
         self._events: dict[Happening, list[StreamEvent]] = {}
         self._pace = _Pace(self, round(hole_s * _NS), rate_hz, recorded)
         self._sharp: deque[float] = deque(maxlen=_SHARP_OF)  # of the newest images, blurred ones left out
@@ -176,7 +227,9 @@ class StreamJudge:
         known = self._events
         if (pause := self._pace.pending) is not None:
             known = known | {pause[0]: _joined(known.get(pause[0], []), StreamEvent(self.stream, *pause))}
-        return sorted((e for some in known.values() for e in some), key=lambda e: (e.from_ns, e.happening))
+        all_known = (e for some in (*known.values(), *self._of_axes.values()) for e in some)
+        told = (e for e in all_known if e.happening is not Happening.MOVING or e.rows >= _FEWEST)
+        return sorted(told, key=lambda e: (e.from_ns, e.happening))
 
     @property
     def steps_ns(self) -> list[int]:
@@ -198,41 +251,43 @@ class StreamJudge:
     def takes(self, t_ns: int, row: Sequence[float] = ()) -> bool:
         """Take a row as it comes; return whether it is a measurement of a time of its own."""
         newest = self._newest_ns
-        if any(not abs(value) <= most for value, most in zip(row, self._most, strict=False)):  # also what is no number
+        if not self._axes.are_possible(row):
             return self._refuse(Happening.UNUSABLE, t_ns)
         if newest is not None and t_ns <= newest:
             if t_ns < newest or self._behind:
                 return self._is_behind(t_ns, row, newest)
-            if row != self._last:
+            if row != self._rows.last:
                 self._pace.shared += 1
                 self._pace.hurried += self._pace.pause is not None
             return self._refuse(Happening.DUPLICATE, t_ns)
         if self._behind:
             self._let_late()
-        if row and self._repeats(t_ns, row):
-            return self._refuse(Happening.STUCK, t_ns, self._run_ns)
+        if row and not self._is_alive(t_ns, row):
+            return False
         if len(self._first) < _STEP_ROWS:
             self._first.append((t_ns, row))
+        self._taken = row
         self._newest_ns, is_after_refused, self._is_refused = t_ns, self._is_refused, False
         if newest is not None and not is_after_refused:
             self._pace.see(newest, t_ns)
         return True
 
-    def look(self, image: ImageU8, from_ns: int, to_ns: int) -> None:
-        """Look at an image [H, W], which stands for those of a stretch of time: whether it is dark or blurred."""
+    def look(self, image: ImageU8, from_ns: int, to_ns: int) -> bool:
+        """Look at an image [H, W], which stands for those of a stretch of time; return whether it shows nothing."""
         if is_dark(image):
-            return self.note(Happening.DARK, from_ns, to_ns)
+            self.note(Happening.DARK, from_ns, to_ns)
+            return True
         sharp = _sharpness(image)
         if len(self._sharp) < _STEP_ROWS or sharp > _BLURRED * float(np.median(self._sharp)):
             self._sharp.append(sharp)
             self._blur = 0, 0, 0
-            return None
+            return False
         since_ns, images, noted = self._blur if self._blur[1] else (from_ns, 0, 0)
         if images + 1 >= _STEP_ROWS and to_ns - since_ns >= _NS:
             self.note(Happening.BLURRED, since_ns, to_ns, images + 1 - noted)
             noted = images + 1
         self._blur = since_ns, images + 1, noted
-        return None
+        return False
 
     def correct(self, t_ns: int) -> None:
         """Take the stamp of the newest row for a wrong one, which had leapt ahead: a row at `t_ns` is in its place."""
@@ -251,6 +306,25 @@ class StreamJudge:
         self._is_refused = self._is_refused or happening in (Happening.STUCK, Happening.UNUSABLE)
         self.note(happening, t_ns if from_ns is None else from_ns, t_ns)
         return False
+
+    def _is_alive(self, t_ns: int, row: Sequence[float]) -> bool:
+        """Refuse a row that repeats others, as a whole or in one axis, or that leaps where the next does not follow."""
+        stuck_axes = self._axes.stuck(t_ns, row)
+        if self._rows.take(t_ns, row):
+            return self._refuse(Happening.STUCK, t_ns, self._rows.since_ns)
+        for name, since_ns in stuck_axes:
+            event = StreamEvent(f"{self.stream} {name}", Happening.STUCK, since_ns, t_ns, 1)
+            self._of_axes[name] = _joined(self._of_axes.get(name, []), event)
+        leapt, is_soon = self._leapt, t_ns - (self._newest_ns or 0) <= _HOLE * self.usual_ns
+        leaps = is_soon and self._axes.leaps(row, self._taken)
+        is_far = leaps and (leapt is None or self._axes.leaps(row, leapt[1]))  # two that agree are a motion
+        if leapt is not None and leaps == is_far:
+            self.note(Happening.SPIKE, leapt[0], leapt[0])
+        self._leapt = (t_ns, row) if is_far else None
+        if stuck_axes or is_far:
+            self.refused[Happening.STUCK if stuck_axes else Happening.SPIKE] += 1
+            self._is_refused = True
+        return not (stuck_axes or is_far)
 
     def _is_behind(self, t_ns: int, row: Sequence[float], newest_ns: int) -> bool:
         """Refuse a row behind the newest; several that go on among each other say that the clock stepped back."""
@@ -280,18 +354,6 @@ class StreamJudge:
             for t_ns, _ in self._behind:
                 self.note(Happening.LATE, t_ns, t_ns)
         self._behind.clear()
-
-    def _repeats(self, t_ns: int, row: Sequence[float]) -> bool:
-        """Whether a row equals more before it than chance explains, by how often neighbours were equal up to now."""
-        if row != self._last:
-            usual = 0 if self._is_stuck else self._run
-            self._pairs, self._equal = self._pairs + usual + 1, self._equal + usual
-            self._last, self._run, self._run_ns, self._is_stuck = row, 0, t_ns, False
-            return False
-        self._run += 1
-        by_chance = self._pairs * ((self._equal + 1.0) / (self._pairs + 1.0)) ** self._run
-        self._is_stuck = self._pairs - self._equal >= _CHANGES and by_chance < _BY_CHANCE
-        return self._is_stuck
 
 
 def _joined(known: list[StreamEvent], event: StreamEvent) -> list[StreamEvent]:

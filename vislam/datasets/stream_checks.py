@@ -15,7 +15,7 @@ from vislam.core.streams import Happening, StreamJudge, together
 from vislam.datasets.images import ImageList
 from vislam.datasets.tables import Row
 from vislam.imu import ConditionWatch
-from vislam.imu.series import MOST
+from vislam.imu.series import AXES
 
 _FEW = 3  # images or rows that are worth no warning
 _NAMED = 3  # events of a kind in a stream, the longest
@@ -39,7 +39,7 @@ class StreamChecks:
 
     def watched(self, rows: Iterable[Row[list[float]]]) -> Iterator[Row[list[float]]]:
         """Yield inertial rows (rates, forces), all of them, after the judge has seen them."""
-        judge = self._judges["imu0"] = StreamJudge("imu0", MOST)
+        judge = self._judges["imu0"] = StreamJudge("imu0", AXES)
         for t_ns, values in rows:
             if judge.takes(t_ns, values):
                 six = np.array(values)

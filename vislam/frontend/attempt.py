@@ -128,6 +128,7 @@ class Attempt:
     twist_per_s: Array  # [6] velocity of the camera
     estimate: PoseEstimate
     failure: str  # empty when the pose can be trusted
+    others: int = 0  # tracks that agree on another motion
 
     @property
     def followed(self) -> int:

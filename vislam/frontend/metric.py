@@ -132,11 +132,12 @@ class MetricFrontEnd:
                     frame, vo, tracks.T_key_cam, tracks.exposures.lag, attempt.twist_per_s
                 )
             new, observations = self._continue_from(frame, attempt)
-            return TrackResult(vo, observations, new, departure.parallax_px, reason)
+            return TrackResult(vo, observations, new, departure.parallax_px, reason, others=attempt.others)
         good = attempt.estimate.inliers
         observations = tracks.observations(good, attempt.pixels, attempt.xy)
         tracks.judge(good)
-        return TrackResult(vo, observations, None, departure.parallax_px, self._weakness(attempt))
+        weakness = self._weakness(attempt)
+        return TrackResult(vo, observations, None, departure.parallax_px, weakness, others=attempt.others)
 
     # -- what it is made of ------------------------------------------------------------------------------------------
 

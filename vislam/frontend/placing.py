@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vislam.config import FrontEndConfig
 from vislam.core.geometry import invert, se3_log
-from vislam.core.messages import Array, Frame, Keyframe
+from vislam.core.messages import Array, Bools, Frame, Keyframe
 from vislam.frontend.attempt import Attempt, confirmed, failure
 from vislam.frontend.blind_keyframe import BlindKeyframe
 from vislam.frontend.keyframe_tracks import KeyframeTracks
 from vislam.frontend.view import DepthReading
 from vislam.vision.landmarks import metric_points, move
 from vislam.vision.locate import pnp_ransac, recognise
-from vislam.vision.refine import PoseEstimate, pose_covariance, refine_pose
+from vislam.vision.refine import CHI2_GATE, PoseEstimate, pose_covariance, refine_pose
 
 _DEPTH_NOW_FACTOR = 2.0  # on the sigma of depth between keyframes, which is not averaged over time
 # times what tracks scatter by: the noise of independent tracks that would move a pose as much. What neighbours have in
@@ -22,6 +24,8 @@ _ALIKE = 4.0
 _USUAL_PX = 0.25  # scatter of tracks beside which depth errs as it is assumed: what blurs or bends images spoils both
 _RANSAC_PX = 3.0
 _RANSAC_BELOW = 0.6  # of the tracks agree: the prediction may have led astray
+_WITH_THE_ROOM = 0.8  # of the tracks that agreed in the keyframe, at least, where a frame moves with it
+_OTHERS, _OTHERS_AGREE = 0.1, 0.7  # least shares, of those that agree and of the others: they move as one rigid thing
 _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a later frame
 
 
@@ -37,15 +41,14 @@ class Placer:
 
     def attempt(self, frame: Frame, T_guess: Array, dt_s: float) -> Attempt:
         """Follow the tracks from where a guess puts them, and place the frame `dt_s` after the one before."""
-        return self._place(frame, T_guess, dt_s, self._tracks.follow(frame, T_guess, dt_s))
+        by_most = self._place(frame, T_guess, dt_s, self._tracks.follow(frame, T_guess, dt_s))
+        placed = self._with_the_room(by_most, frame, T_guess, dt_s)
+        return replace(placed, others=self._others(by_most.xy, placed))
 
     def confirmed(self, attempt: Attempt, frame: Frame, T_expected: Array, dt_s: float) -> Attempt:
         """Return the attempt, or another without the tracks that are not where the filter's motion puts them."""
         tracks = self._tracks
-        expected, covariance = move(tracks.landmarks.mean, tracks.landmarks.covariance, T_expected)
-        gate_xy = self._config.astray_px / tracks.camera.fx
-        gate_xy = gate_xy + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
-        astray = np.linalg.norm(attempt.xy - expected[:, :2], axis=1) > gate_xy
+        astray = self._astray(attempt.xy, T_expected, self._config.astray_px / tracks.camera.fx)
         return confirmed(
             attempt, astray, lambda pixels: self._place(frame, T_expected, dt_s, pixels), self._config
         )  # fmt: skip
@@ -97,6 +100,40 @@ class Placer:
             *self._weighed(attempt.depth_now), scale, shear, exposures.shutter.sigma_s,
         )  # fmt: skip
         return attempt.estimate.covariance if found is None else found
+
+    def _with_the_room(self, attempt: Attempt, frame: Frame, T_guess: Array, dt_s: float) -> Attempt:
+        """Return the attempt, or another by the tracks that agreed in the keyframe, where new ones outvote them.
+
+        These went with the room, and something that moves by itself has come before the camera since.
+        """
+        proven = self._tracks.tracker.proven
+        found = int((proven & np.isfinite(attempt.xy[:, 0])).sum())
+        if (attempt.agreeing & proven).sum() >= _WITH_THE_ROOM * found:
+            return attempt
+        alone = self._place(frame, T_guess, dt_s, np.where(proven[:, None], attempt.pixels, np.nan))
+        if alone.failure or (attempt.agreeing & alone.agreeing).sum() >= _WITH_THE_ROOM * alone.inliers:
+            return attempt
+        T_key_cam = alone.estimate.T_key_cam
+        astray = self._astray(attempt.xy, T_key_cam, np.sqrt(CHI2_GATE) * self._tracks.sigma_xy)
+        return self._place(frame, T_key_cam, dt_s, np.where(astray[:, None], np.nan, attempt.pixels))
+
+    def _others(self, xy: Array, placed: Attempt) -> int:
+        """Return how many tracks at `xy` [N, 2] agree on another motion than a frame's; 0 where that may be chance."""
+        mean, inliers = self._tracks.landmarks.mean, placed.agreeing
+        apart = self._tracks.landmarks.known & (mean[:, 2] > 0.0) & np.isfinite(xy[:, 0]) & ~inliers
+        least = max(self._config.min_inliers, _OTHERS * inliers.sum(), _OTHERS_AGREE * apart.sum())
+        T_other = None if apart.sum() < least else self._ransac(metric_points(mean[apart]), xy[apart])
+        if T_other is None:
+            return 0
+        agree = int(self._refine(T_other, np.where(apart[:, None], xy, np.nan), None).inliers.sum())
+        return agree if agree >= least else 0
+
+    def _astray(self, xy: Array, T_expected: Array, gate_xy: float) -> Bools:
+        """Return which tracks [N] are not where a motion puts them, by more than the gate and what landmarks err by."""
+        landmarks = self._tracks.landmarks
+        expected, covariance = move(landmarks.mean, landmarks.covariance, T_expected)
+        gate = gate_xy + 3.0 * np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+        return np.asarray(np.linalg.norm(xy - expected[:, :2], axis=1) > gate)
 
     def _place(self, frame: Frame, T_guess: Array, dt_s: float, pixels: Array) -> Attempt:
         """Place the frame by tracks found at `pixels` [N, 2], from a guess."""

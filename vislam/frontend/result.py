@@ -30,6 +30,7 @@ class TrackResult:
     sigma_px: float = float("nan")  # of a track's pixel, as this run showed it up to now; told until enough was seen
     by_depth: bool = False  # vision failed, and the depth image alone places the frame
     outliers: float = 0.0  # share of the followed tracks that do not agree on a motion, before a filter has its say
+    others: int = 0  # tracks that agree on another motion than the frame's: something moves by itself
 
     def with_scatter(self, sigma_px: float, noise: float) -> TrackResult:
         """Return the result with what the run shows of its tracks; `noise` as in `Observations`."""

@@ -47,6 +47,7 @@ class Tracker:
         self.ids: NDArray[np.int64] = np.empty(0, dtype=np.int64)
         self.pixels: Array = np.empty((0, 2))  # [N, 2] in the keyframe
         self.misses: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # [N] frames in a row without a good match
+        self.proven: Bools = np.zeros(0, dtype=np.bool_)  # [N] agreed in the keyframe: they go with the room
         self._given = False  # whether tracks are given
         self._dropped: set[int] = set()  # given tracks that may still be there but are not wanted any more
 
@@ -116,6 +117,7 @@ class Tracker:
         self.ids = np.concatenate([self.ids, ids])
         self.pixels = np.vstack([self.pixels, fresh])
         self.misses = np.zeros(len(self.ids), dtype=np.int64)
+        self.proven = np.arange(len(self.ids)) < len(self.ids) - len(ids)
         self._image = frame.images[0] if frame.images else None
         return len(ids)
 
@@ -144,6 +146,7 @@ class Tracker:
         if self._given:
             self._dropped.update(self.ids[~which].tolist())
         self.ids, self.pixels, self.misses = self.ids[which], self.pixels[which], self.misses[which]
+        self.proven = self.proven[which]
 
 
 def given_rows(given: Observations, values: Array, ids: NDArray[np.int64]) -> Array:

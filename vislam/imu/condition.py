@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from vislam.core.messages import Array, ImuSample
 from vislam.core.streams import Happening, StreamEvent, StreamJudge
+from vislam.imu.series import AXES
 
 _NS = 1_000_000_000
 _WINDOW, _AGAIN = 256, 96  # samples looked at together, and how many of them again in the next window
 _HOLE = 2.5  # usual intervals; a longer one is a hole
 _COARSE_STEPS = 8.0  # of the sensor's resolution
-_AXES = [f"{unit} {axis}" for unit in ("gyro", "accelerometer") for axis in "xyz"]
+_AXES = [axis.name for axis in AXES]
 _BY_CHANCE = 1e-3  # plateaus at the end of the range that chance would make in the whole recording
 
 

@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.messages import Array, ImuSample, ImuSpan, NoiseScale
+from vislam.core.stream_axes import Axis
 from vislam.core.streams import StreamJudge
 
 _FIRST_CAPACITY = 1024  # samples; doubles when the live part needs more
-MOST = (*3 * (1e3,), *3 * (1e4,))  # rad/s, m/s^2; beyond every sensor: such numbers come from a broken transfer
+# rad/s, m/s^2. What is beyond every sensor comes from a broken transfer. A leap, there and back in three samples, would
+# be a body that carries a camera at 10 g or that turns over 500 degrees a second, for one sample
+AXES = (*(Axis(f"gyro {a}", 1e3, 10.0) for a in "xyz"), *(Axis(f"accelerometer {a}", 1e4, 100.0) for a in "xyz"))
 
 
 class ImuSeries:
@@ -37,7 +40,7 @@ class ImuSeries:
         self._begin = 0
         self._end = 0
         self._newest_t_ns = -(1 << 62)
-        self.judge = StreamJudge("imu0", MOST, max_gap_s, rate_hz)
+        self.judge = StreamJudge("imu0", AXES, max_gap_s, rate_hz)
 
     def __len__(self) -> int:
         """Return the number of samples held."""

@@ -141,8 +141,8 @@ class RunWatch:
         if self._is_blind:
             self.feed.count(frame)
             return frame
-        self.feed.add(frame)
-        return replace(dark(frame, frame.t_ns), follows_step=frame.follows_step) if self.feed.is_frozen else frame
+        seen = self.feed.add(frame)
+        return replace(dark(frame, frame.t_ns), follows_step=frame.follows_step) if self.feed.is_frozen else seen
 
     def note(self, track: TrackResult, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
         """Take what became of the frame that `feed` has.
@@ -153,7 +153,7 @@ class RunWatch:
             state: the filter's before the frame.
             at_rest: whether the body rested over it.
         """
-        self.feed.moved(at_rest)
+        self.feed.moved(at_rest, track.others > 0)
         self.tracks.add(track.sigma_px, track.observations)
         if not self._knows_scale:
             self.uniform.add(span, state, at_rest)
@@ -195,7 +195,7 @@ class RunWatch:
 def report_of(front: Front) -> FrontReport:
     """Return what there is to say of a run so far."""
     imu, begun = front.inertial, front.begun
-    events = [*front.watch.feed.judge.events, *([] if imu is None else imu.buffer.events)]
+    events = [*front.watch.feed.events, *([] if imu is None else imu.buffer.events)]
     report = FrontReport(
         front.frontend.mode, None, front.start, begun.refusal, _counters(front), {}, [], {},
         front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, told_noise=front.noise,

@@ -45,7 +45,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         frames_by_depth=front.get("frames_by_depth", 0),
         frames_missing=feed.get("missing", 0),
         frames_repeated=max(feed.get("frozen", 0) - _equal_in_the_dark(report.events), 0),
-        dark_s=max((_lasted_s(e) for e in report.events if e.happening is Happening.DARK), default=0.0),
+        dark_s=max((_lasted_s(e) for e in report.events if _is_dark(e)), default=0.0),
         frames_offered=live.get("frames_offered", 0),
         frames_dropped=live.get("frames_dropped", 0),
         frames_left_out=live.get("frames_left_out", 0),
@@ -73,6 +73,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         gravity_m_s2=machine.gravity_m_s2,
         max_gap_s=machine.max_gap_s,
         events=tuple(_together([e for e in report.events if _matters(e, machine.max_gap_s)], report.first_t_ns)),
+        moving=tuple(_together([e for e in report.events if e.happening is Happening.MOVING], report.first_t_ns)),
         causes=tuple(_together([e for e in report.events if _may_explain(e)], report.first_t_ns)),
         **_calibration(report.calibration),
     )
@@ -102,14 +103,19 @@ def _may_explain(event: StreamEvent) -> bool:
     return event.happening is Happening.HOLE and event.stream.startswith("cam") and _lasted_s(event) > LOST_S
 
 
+def _is_dark(event: StreamEvent) -> bool:
+    """Whether an event is that vision has nothing to see; of a second camera, or of depth, it goes on without."""
+    return event.happening is Happening.DARK and event.stream == "cam0"
+
+
 def _lasted_s(event: StreamEvent) -> float:
     return (event.to_ns - event.from_ns) * 1e-9
 
 
 def _equal_in_the_dark(events: Sequence[StreamEvent]) -> int:
     """Return how many images equal the one before because both are dark: no driver is stuck."""
-    dark = [event for event in events if event.happening is Happening.DARK]
-    equal = (event for event in events if event.happening is Happening.REPEATED)
+    dark = [event for event in events if _is_dark(event)]
+    equal = (event for event in events if event.happening is Happening.REPEATED and event.stream == "cam0")
     return sum(e.rows for e in equal if any(d.from_ns <= e.from_ns and e.to_ns <= d.to_ns for d in dark))
 
 

@@ -27,7 +27,7 @@ from vislam.core.errors import HardwareError, StorageError, UsageError
 from vislam.core.files import write_text
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.core.recording import Problems
-from vislam.core.streams import Happening, StreamEvent, StreamJudge
+from vislam.core.streams import Happening, Repeats, StreamEvent, StreamJudge
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.recorder import Recorder
@@ -40,7 +40,7 @@ from vislam.hw.library_cameras import gives_frames, open_frame_camera, open_with
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
 from vislam.hw.source import CapturedImage, InertialSource
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
-from vislam.imu.series import MOST
+from vislam.imu.series import AXES
 from vislam.runs.camera_rig import rig_of
 from vislam.runs.recorded_readings import FurtherPorts, ReadingRecorder
 
@@ -190,8 +190,8 @@ class _Recording:
         self._is_stopping = threading.Event()
         self._images_ended = threading.Event()
         rate_hz = 0.0 if inertial is None else inertial.rate_hz
-        self._judges = {"imu0": StreamJudge("imu0", MOST, rate_hz=rate_hz), "cam0": StreamJudge("cam0")}
-        self._first_ns, self._shown = recorded.began_ns, np.empty((0, 0), dtype=np.uint8)
+        self._judges = {"imu0": StreamJudge("imu0", AXES, rate_hz=rate_hz), "cam0": StreamJudge("cam0")}
+        self._first_ns, self._repeats = recorded.began_ns, Repeats()
         self._began_utc = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
     def run(self, first: Shot | None, seconds: float | None, progress: Callable[[Recorded], None] | None) -> Recorded:
@@ -226,8 +226,10 @@ class _Recording:
             if self._readings is not None:
                 recorded.notes += self._readings.notes()
             events = [event for judge in self._judges.values() for event in judge.events]
-            recorded.events = [event.entry(self._first_ns, _done(event)) for event in events]
-            recorded.notes += tuple(event.words(self._first_ns, _done(event)) for event in events[:_NAMED_EVENTS])
+            recorded.events = [replace(event, done=_done(event)).entry(self._first_ns) for event in events]
+            recorded.notes += tuple(
+                replace(event, done=_done(event)).words(self._first_ns) for event in events[:_NAMED_EVENTS]
+            )
         except StorageError as error:
             recorded.ended = str(error)
             with suppress(StorageError, OSError):  # what went wrong first is what is reported
@@ -303,9 +305,8 @@ class _Recording:
         judge, shown = self._judges["cam0"], image.images[0]
         if judge.takes(image.t_ns):
             judge.look(shown, image.t_ns, image.t_ns)
-            if np.array_equal(shown, self._shown):
+            if self._repeats.take(shown):
                 judge.note(Happening.REPEATED, image.t_ns, image.t_ns)
-        self._shown = shown
         self._recorder.write(image)
 
     def _why_end(self, seconds: float | None) -> str:

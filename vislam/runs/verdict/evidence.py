@@ -45,6 +45,7 @@ class Evidence:
 
     events: tuple[str, ...] = ()  # in streams of sensors, that leave less to go on
     causes: tuple[str, ...] = ()  # events that are no doubt by themselves, but explain others
+    moving: tuple[str, ...] = ()  # events: something moved by itself before the camera
     # vision
     mode: str = ""
     frames: int = 0

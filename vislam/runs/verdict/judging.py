@@ -76,7 +76,7 @@ def judge(evidence: Evidence, config: VerdictConfig) -> Verdict:
     slow, lost = tuple(_slow(evidence, config)), tuple(_lost(evidence, config))
     reasons = tuple(reason for test in _TESTS for reason in test(evidence, config))
     state = Trust.LOST if lost else Trust.DOUBTFUL if slow or reasons else Trust.TRUSTED
-    causes = evidence.causes if lost or reasons else ()
+    causes = evidence.causes + evidence.moving * evidence.has_imu if lost or reasons else ()
     return Verdict(state, slow + causes + lost + reasons, tuple(_moved(evidence, config)))
 
 
@@ -148,6 +148,9 @@ def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
         )
     if e.frames_repeated >= _REPEATED_FRAMES:
         yield f"{e.frames_repeated} images repeat the one before while the body moves: the camera's driver is stuck"
+    if e.moving and not e.has_imu:  # an IMU would know the motion of the body
+        more = f", and {len(e.moving) - 1} times more" if len(e.moving) > 1 else ""
+        yield f"{e.moving[0]}{more}: do not trust the way since then, and keep the camera off what moves"
     if e.submaps_apart:
         yield f"{e.submaps_apart} submaps are joined with nothing: return to where the camera has been"
 

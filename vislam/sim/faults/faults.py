@@ -195,7 +195,7 @@ _THROUGHOUT: Mapping[str, Fault] = {
 
 # what begins at some moment
 BREAKS: Mapping[str, Fault] = {
-    "person": Fault("a person over half of the image", _IMAGES, cam.person, _ON),
+    "person": Fault("a person over half of the image", _IMAGES, cam.person, _ON, ("cam0 moving",)),
     **{f"imu hole {s}": Fault(f"no inertial sample for {s} s", _IMU, gone(ImuSample), (s, s), ("imu0 hole",), _ANY)
        for s in (0.3, 1.0, 3.0)},
     "camera hole 0.3": Fault("no frame for 0.3 s", _ANY, gone(Frame), (0.3, 0.3), ("cam0 hole",), _IMU),
@@ -218,7 +218,7 @@ BREAKS: Mapping[str, Fault] = {
     "stuck": Fault("one inertial sample again and again", _IMU, held(
         ImuSample, lambda first, row: replace(first, t_ns=row.t_ns)), _ON, ("imu0 stuck",), _SCALE),
     "axis stuck": Fault("the gyro's z axis repeats one value", _IMU, held(ImuSample, lambda first, row: replace(
-        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, ("imu0 ?",), _SCALE),
+        row, gyro_rad_s=np.append(row.gyro_rad_s[:2], first.gyro_rad_s[2]))), _ON, ("imu0 stuck",), _SCALE),
     "twice": Fault("half of the inertial rows come twice", _IMU, imu.TWICE, _LONG, ("imu0 duplicate",), _ANY),
     "repeated": Fault("every other sample is the one before", _IMU, imu.TWINS, _LONG, (), _SCALE),
     "disordered": Fault("one inertial row in fifty is late", _IMU, imu.DISORDERED, _ON, ("imu0 late",), _ANY),
@@ -229,13 +229,13 @@ BREAKS: Mapping[str, Fault] = {
     "clipped": Fault("the gyro saturates at 0.5 rad/s", _IMU, imu.CLIPPED, _ON, ("imu0 clipped",), _SCALE),
     "noise": Fault("white noise eight times that of the model", _IMU, imu.NOISY, _ON),
     "vibration": Fault("the vibration of a propeller, aliased", _IMU, imu.SHAKEN, _ON),
-    "spikes": Fault("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, ("imu0 ?",), _SCALE),
+    "spikes": Fault("one inertial sample in a hundred is a spike", _IMU, imu.SPIKES, _ON, ("imu0 spike",), _SCALE),
     "reconnected": Fault("the IMU comes back with two axes turned", _IMU, imu.scaled(-1, -1, 1, -1, -1, 1), _ON,
         ("imu0 contradicting",), _SCALE),
     "now in g": Fault("the IMU comes back with another unit", _IMU, imu.IN_G, _ON, ("imu0 contradicting",), _SCALE),
     "black": Fault("black images", _IMAGES, cam.BLACK, _LONG, ("cam0 dark",)),
-    "white": Fault("white images", _IMAGES, cam.WHITE, _LONG, ("cam0 ?",)),
-    "covered": Fault("a hand on the lens", _IMAGES, cam.COVERED, _LONG, ("cam0 ?",)),
+    "white": Fault("white images", _IMAGES, cam.WHITE, _LONG, ("cam0 dark",)),
+    "covered": Fault("a hand on the lens", _IMAGES, cam.COVERED, _LONG, ("cam0 dark",)),
     "frozen": Fault("the same image again and again", _IMAGES, held(Frame, cam.as_before), _LONG, ("cam0 repeated",)),
     "now and then": Fault("one image in ten repeats the one before", _IMAGES, cam.HICCUPS, _ON, (), _ANY),
     "salt": Fault("5 % of the pixels are salt and pepper", _IMAGES, cam.SALTED, _ON),
@@ -248,7 +248,7 @@ BREAKS: Mapping[str, Fault] = {
         frame, images=(frame.images[0], *first.images[1:]))), _LONG, ("cam1 repeated",), _IMU),
     "one gone": Fault("one camera of two sends nothing", _PAIR, cam.ONE_GONE, _LONG, ("cam1 hole",), _IMU),
     "crossed": Fault("left and right are exchanged", _needs("stereo"), cam.SWAPPED, _ON, ("cam0 ?",)),
-    "no depth": Fault("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, ("depth0 ?",)),
+    "no depth": Fault("no pixel has depth", _RGBD, cam.NO_DEPTH, _LONG, ("depth0 dark",)),
     "frozen depth": Fault("the same depth image again and again", _RGBD, held(
         Frame, lambda first, frame: replace(frame, depth_m=first.depth_m)), _LONG, ("depth0 repeated",)),
 }  # fmt: skip
