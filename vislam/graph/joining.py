@@ -128,8 +128,8 @@ class Waiting:
         T, agreeing = found
         sigmas_m = [np.sqrt(np.linalg.eigvalsh(ties[e.record.id][3:, 3:])[-1]) for e in agreeing if e.record.id in ties]
         if not sigmas_m:
-            return False
-        reach_m = _REACH_SIGMAS * max(sigmas_m)
+            return bool(np.isfinite(repeats_m))
+        reach_m = _REACH_SIGMAS * min(sigmas_m)
         more = sum(reach_m > step_m for step_m in _FRAME_REACH_M)
         if len({e.record.to_id for e in agreeing}) < JOIN_FRAMES + more:
             return True

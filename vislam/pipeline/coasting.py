@@ -32,6 +32,7 @@ class Coasting:
         self._t_ns: list[int] = []
         self._poses: list[Array] = []
         self._twists: list[Array] = []  # of the body, per second
+        self._t_twist_ns: int | None = None  # when the last of them was measured; None: never
         self._sums, self._counts = np.zeros((len(_LAGS_S), 2)), np.zeros(len(_LAGS_S))
         self._recent = np.zeros((len(_LAGS_S), 2))
 
@@ -44,6 +45,7 @@ class Coasting:
         if self._t_ns:
             k = max(self._at_or_before(t_ns - round(_TWIST_S * _NS)), 0)
             twist = se3_log(invert(self._poses[k]) @ T_vo_body) / ((t_ns - self._t_ns[k]) / _NS)
+            self._t_twist_ns = t_ns
         self._t_ns.append(t_ns)
         self._poses.append(T_vo_body)
         self._twists.append(twist)
@@ -56,14 +58,26 @@ class Coasting:
         self._t_ns.clear()
         self._poses.clear()
         self._twists.clear()
+        self._t_twist_ns = None
+
+    def go_on(self, t_ns: int, T_vo_body: Array) -> None:
+        """Begin again at a pose [4, 4] that was not measured, at the velocity that was: poses follow from there."""
+        twists, t_twist_ns = self._twists[-1:], self._t_twist_ns
+        self.restart()
+        if t_twist_ns is not None:
+            self._t_ns, self._poses, self._twists, self._t_twist_ns = [t_ns], [T_vo_body], twists, t_twist_ns
+
+    def since_s(self, t_ns: int) -> float:
+        """Return the time since the last pose, which there is."""
+        return (t_ns - self._t_ns[-1]) / _NS
 
     def ahead(self, t_ns: int) -> tuple[Array, Array] | None:
         """Return the motion [4, 4] since the last pose and its covariance [6, 6]; None: there is no habit."""
-        if len(self._t_ns) < 2:
+        if self._t_twist_ns is None:
             return None
-        dt_s = (t_ns - self._t_ns[-1]) / _NS
-        variance = np.maximum(self._density(dt_s), _LEAST) * (_TAILS**2 * dt_s**3 / 3.0)
-        return se3_exp(self._twists[-1] * dt_s), np.diag(np.repeat(variance, 3))
+        spread_s = (t_ns - self._t_twist_ns) / _NS
+        variance = np.maximum(self._density(spread_s), _LEAST) * (_TAILS**2 * spread_s**3 / 3.0)
+        return se3_exp(self._twists[-1] * self.since_s(t_ns)), np.diag(np.repeat(variance, 3))
 
     def _learn(self, t_ns: int, T_vo_body: Array) -> None:
         for n, lag_s in enumerate(_LAGS_S):
