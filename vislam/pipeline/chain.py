@@ -27,7 +27,6 @@ from vislam.pipeline.coasting import Coasting
 from vislam.pipeline.inertial_stages import Inertial
 
 _CONTRADICTION = chi_square_limit(0.9999, 6)
-_MOST_M_S2 = 50.0  # five g: impacts have more, for less than the interval of two frames
 _BLIND_S = 5.0  # dead reckoning from an unknown velocity is off by metres after so long
 
 
@@ -92,7 +91,7 @@ class KeyframeChain:
         if coasted is None or vo.keyframe_id != self.id:
             return False
         off = se3_log(invert(coasted[0]) @ vo.T_keyframe_body)
-        if not self._is_lost and np.linalg.norm(off[3:]) < 0.5 * _MOST_M_S2 * self._coasting.since_s(vo.t_ns) ** 2:
+        if not self._is_lost and np.linalg.norm(off[3:]) < self._coasting.jerked_m(vo.t_ns):
             return False
         return bool(off @ np.linalg.solve(coasted[1] + vo.covariance, off) > _CONTRADICTION)
 
