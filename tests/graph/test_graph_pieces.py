@@ -166,13 +166,30 @@ def test_a_review_lets_no_loop_in_that_tears_a_submap_from_where_habit_led(world
     assert {decided[k] for k in inside} == {LoopDecision.ACCEPTED}
 
 
-def test_where_places_are_known_to_repeat_within_reach_a_submap_stays_apart(world: World) -> None:
-    """Loops inside the old submap that miss all by the same step in map tell of a wall of equal panels."""
+def test_a_place_that_habit_makes_unlikely_joins_nothing_though_all_frames_see_it(world: World) -> None:
+    frames = (152, 154, 156, 158, 160, 162)
+    for step_m, groups in ((1.8, (0, 1)), (0.8, (0, 0))):
+        edges = {edge.to_id: [edge] for edge in panels_further(world, frames, step_m)}
+        assert tied(loose(world, imu=False), world, edges, 0.5).submaps.groups == groups
+
+
+def panels_before(world: World) -> dict[int, list[LoopEdge]]:
+    """Return loops inside the old submap that miss all by the same step in map: they tell of a wall of equal panels."""
     step = transform(np.eye(3), np.array([1.5, 0.0, 0.0]))
-    alike = {
+    return {
         k: [replace(world.loop(k, k - 80, k), T_from_to=invert(world.truth[k - 80]) @ step @ world.truth[k])]
         for k in (110, 120, 130)
     }
+
+
+def test_a_submap_that_nothing_ties_stays_apart_where_places_are_known_to_repeat(world: World) -> None:
+    true = loops(world, 160, 163)
+    assert run(loose(world, False), world, true, False, TILTED)[-1].submaps.groups == (0, 0)
+    assert run(loose(world, False), world, panels_before(world) | true, False, TILTED)[-1].submaps.groups == (0, 1)
+
+
+def test_where_places_are_known_to_repeat_within_reach_a_submap_stays_apart(world: World) -> None:
+    alike = panels_before(world)
     true = {k: panels_further(world, (k,), 0.0, 10 * k) for k in (152, 154, 156, 158, 160, 162)}
     assert tied(loose(world, imu=False), world, alike | true, 0.5).submaps.groups == (0, 1)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,21 @@ def test_a_body_in_steady_motion_goes_on_and_one_without_habit_nowhere() -> None
     assert coasting.ahead(round(4.0 * NS)) is None
 
 
+def test_a_submap_that_habit_ties_takes_its_velocity_on_and_what_is_not_known_of_it() -> None:
+    through, over = Coasting(), Coasting()
+    for coasting in (through, over):
+        for k in range(30):
+            coasting.follow(k * NS // 10, transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0])))
+    over.go_on(33 * NS // 10, transform(np.eye(3), np.array([3.3, 0.0, 0.0])))
+    whole, rest = through.ahead(37 * NS // 10), over.ahead(37 * NS // 10)
+    assert whole is not None and rest is not None
+    np.testing.assert_allclose(rest[0][:3, 3], [0.4, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(rest[1], whole[1])  # no less: the velocity is as old
+    fresh = Coasting()
+    fresh.go_on(0, np.eye(4))
+    assert fresh.ahead(NS) is None
+
+
 def test_a_wild_motion_leaves_less_to_expect() -> None:
     calm, wild, rng = Coasting(), Coasting(), np.random.default_rng(2)
     T_calm, T_wild, speed = np.eye(4), np.eye(4), np.zeros(3)
@@ -62,6 +79,25 @@ def test_a_wild_motion_leaves_less_to_expect() -> None:
     one, other = calm.ahead(105 * NS // 10), wild.ahead(105 * NS // 10)
     assert one is not None and other is not None
     assert other[1][3, 3] > 10.0 * one[1][3, 3]
+
+
+@pytest.mark.parametrize(("off_m", "is_lost", "is_refused"), [
+    (0.15, False, False), (0.5, False, True), (0.05, True, False), (0.15, True, True),
+])  # fmt: skip
+def test_a_frame_one_panel_off_is_refused_and_a_jerk_only_after_a_loss(
+    off_m: float, is_lost: bool, is_refused: bool
+) -> None:
+    chain = KeyframeChain(np.eye(4), 5.0)
+    placed = VoMeasurement(0, -1, np.eye(4), np.eye(6) * 1e-6, True, Tracking.OK, 50)
+    for k in range(20):
+        moved = transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
+        chain.follow(replace(placed, t_ns=k * NS // 10, T_keyframe_body=moved), False)
+    frames = 1
+    if is_lost:
+        chain.follow(replace(placed, t_ns=2 * NS, T_keyframe_body=None, tracking=Tracking.LOST), False)
+        frames = 2
+    moved = transform(np.eye(3), np.array([1.9 + 0.1 * frames - off_m, 0.0, 0.0]))
+    assert chain.contradicts(replace(placed, t_ns=(19 + frames) * NS // 10, T_keyframe_body=moved)) is is_refused
 
 
 @pytest.mark.parametrize("is_torn", [False, True])

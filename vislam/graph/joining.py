@@ -33,6 +33,8 @@ _SUBMAP_TILT_SIGMA_DEG = 5.0  # roll and pitch, where gravity is known on both s
 JOIN_FRAMES = 2
 _JOIN_WAITING = 20  # newest loops between submaps that are compared for that; bounds the work
 _JOIN_MAX_CONTRADICTING = 0.25  # of the loops between two submaps; more, and they wait for further ones
+# how well a place has to fit a tie, whose sigmas have their tails in them: what does not may be the next panel
+_TIE_LIMIT = chi_square_limit(0.9, 6)
 _REACH_SIGMAS = 6.0  # of a tie, within which a place counts as possible beside another one
 _FRAME_REACH_M = (2.0, 5.0)  # beyond each of which one frame more has to agree
 _NEAR_KEYFRAMES = 10  # between which summed odometry bounds what is known well enough
@@ -111,7 +113,7 @@ class Waiting:
 
     def _fits(self, edge: LoopModel, tie: Array, ends: _Ends) -> bool:
         """Return whether a loop agrees with the covariance [6, 6] of the tie between its ends."""
-        return edge.chi2(*ends.of(edge, np.eye(4)), tie) < self._limit
+        return edge.chi2(*ends.of(edge, np.eye(4)), tie) < _TIE_LIMIT
 
     def _has_rival(
         self,
@@ -128,8 +130,8 @@ class Waiting:
         T, agreeing = found
         sigmas_m = [np.sqrt(np.linalg.eigvalsh(ties[e.record.id][3:, 3:])[-1]) for e in agreeing if e.record.id in ties]
         if not sigmas_m:
-            return False
-        reach_m = _REACH_SIGMAS * max(sigmas_m)
+            return bool(np.isfinite(repeats_m))
+        reach_m = _REACH_SIGMAS * min(sigmas_m)
         more = sum(reach_m > step_m for step_m in _FRAME_REACH_M)
         if len({e.record.to_id for e in agreeing}) < JOIN_FRAMES + more:
             return True

@@ -81,13 +81,18 @@ class KeyframeChain:
             self.T_vo_body = self._T_vo_keyframe @ coasted[0]
 
     def contradicts(self, vo: VoMeasurement) -> bool:
-        """Return whether a keyframe is found again, after a loss, where the body cannot have come: it looks alike."""
-        if not self._is_lost or vo.tracking is Tracking.LOST or vo.T_keyframe_body is None or not vo.has_scale:
+        """Return whether a keyframe is seen from where the body cannot have come: what is seen there looks alike.
+
+        After a loss, habit decides; while tracks are followed a body may be jerked out of it, but hardly thrown.
+        """
+        if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None or not vo.has_scale:
             return False
         coasted = self._coasted(vo.t_ns)
         if coasted is None or vo.keyframe_id != self.id:
             return False
         off = se3_log(invert(coasted[0]) @ vo.T_keyframe_body)
+        if not self._is_lost and np.linalg.norm(off[3:]) < self._coasting.jerked_m(vo.t_ns):
+            return False
         return bool(off @ np.linalg.solve(coasted[1] + vo.covariance, off) > _CONTRADICTION)
 
     def by_vision(self, vo: VoMeasurement) -> Array | None:
@@ -124,7 +129,9 @@ class KeyframeChain:
 
     def extend(self, packet: KeyframePacket, T_odom_body: Array | None, state: NavState | None) -> None:
         """Make the keyframe of a packet the newest."""
-        if packet.begins_submap:
+        if packet.begins_submap and packet.vo.T_keyframe_body is not None:
+            self._coasting.go_on(packet.keyframe.t_ns, self.T_vo_body)
+        elif packet.begins_submap:
             self._coasting.restart()
         self._variance_m2 = _variance_m2(state)
         self.id, self.t_ns = packet.keyframe.id, packet.keyframe.t_ns

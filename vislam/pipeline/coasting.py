@@ -21,6 +21,7 @@ _RECENT_S = 3.0  # a motion that has become wilder is wilder now
 # density of acceleration that anything that carries a camera may begin with, rad^2/s^3 and m^2/s^3: after a second 28
 # degrees and 18 cm. A body that has only stood or gone straight has not shown how it turns
 _LEAST = np.array([0.7, 0.1])
+_MOST_M_S2 = 25.0  # that a carried camera has for a tenth of a second; impacts have more, for less
 _TAILS = 1.5  # times the sigma: motions change by fits and starts. Measured on nine of flights, hands and carts
 
 
@@ -32,6 +33,7 @@ class Coasting:
         self._t_ns: list[int] = []
         self._poses: list[Array] = []
         self._twists: list[Array] = []  # of the body, per second
+        self._t_twist_ns: int | None = None  # when the last of them was measured; None: never
         self._sums, self._counts = np.zeros((len(_LAGS_S), 2)), np.zeros(len(_LAGS_S))
         self._recent = np.zeros((len(_LAGS_S), 2))
 
@@ -44,6 +46,7 @@ class Coasting:
         if self._t_ns:
             k = max(self._at_or_before(t_ns - round(_TWIST_S * _NS)), 0)
             twist = se3_log(invert(self._poses[k]) @ T_vo_body) / ((t_ns - self._t_ns[k]) / _NS)
+            self._t_twist_ns = t_ns
         self._t_ns.append(t_ns)
         self._poses.append(T_vo_body)
         self._twists.append(twist)
@@ -56,13 +59,29 @@ class Coasting:
         self._t_ns.clear()
         self._poses.clear()
         self._twists.clear()
+        self._t_twist_ns = None
+
+    def go_on(self, t_ns: int, T_vo_body: Array) -> None:
+        """Begin again at a pose [4, 4] that was not measured, at the velocity that was: poses follow from there."""
+        twists, t_twist_ns = self._twists[-1:], self._t_twist_ns
+        self.restart()
+        if t_twist_ns is not None:
+            self._t_ns, self._poses, self._twists, self._t_twist_ns = [t_ns], [T_vo_body], twists, t_twist_ns
+
+    def jerked_m(self, t_ns: int) -> float:
+        """Return how far off where it coasts to a body may be jerked while it is seen, since the last pose.
+
+        Its velocity is that in the middle of `_TWIST_S`.
+        """
+        dt_s = (t_ns - self._t_ns[-1]) / _NS
+        return 0.5 * _MOST_M_S2 * dt_s * (dt_s + _TWIST_S)
 
     def ahead(self, t_ns: int) -> tuple[Array, Array] | None:
         """Return the motion [4, 4] since the last pose and its covariance [6, 6]; None: there is no habit."""
-        if len(self._t_ns) < 2:
+        if self._t_twist_ns is None:
             return None
-        dt_s = (t_ns - self._t_ns[-1]) / _NS
-        variance = np.maximum(self._density(dt_s), _LEAST) * (_TAILS**2 * dt_s**3 / 3.0)
+        dt_s, spread_s = (t_ns - self._t_ns[-1]) / _NS, (t_ns - self._t_twist_ns) / _NS
+        variance = np.maximum(self._density(spread_s), _LEAST) * (_TAILS**2 * spread_s**3 / 3.0)
         return se3_exp(self._twists[-1] * dt_s), np.diag(np.repeat(variance, 3))
 
     def _learn(self, t_ns: int, T_vo_body: Array) -> None:
