@@ -112,7 +112,7 @@ def test_a_hole_is_a_doubt_of_the_imu_and_a_cause_of_the_camera():
         hole = StreamEvent(stream, Happening.HOLE, 2_000_000_000, 2_000_000_000 + round(lasts_s * 1e9), 3)
         return evidence_of(events=(hole,))
 
-    assert found("imu0", 0.09).events == found("cam0", 5.0).events == ()
+    assert found("imu0", 0.09).events == found("cam0", 5.0).events == found("depth0", 5.0).events == ()
     assert found("cam0", 0.9).causes == found("imu0", 5.0).causes == ()
     assert "imu0: rows are missing from 2.00 to 2.20 s" in found("imu0", 0.2).events[0]
     assert "cam0: rows are missing from 2.00 to 3.10 s" in found("cam0", 1.1).causes[0]

@@ -23,6 +23,7 @@ from vislam.trajectory import Trajectory, align, associate
 
 _MIN_COMPARED = 10  # poses
 _AT_ONCE_NS = 200_000_000
+_OF_FRAMES = ("cam", "depth")  # begin the names of their streams: frames between are bridged by what was seen before
 _SAMPLES = 4  # of a span, at least, for a judgement
 _REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
 _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
@@ -94,13 +95,13 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
 def _matters(event: StreamEvent, max_gap_s: float) -> bool:
     """Whether what happened in a stream leaves so much less to go on that the run is to be doubted."""
     if event.happening in (Happening.STUCK, Happening.UNUSABLE, Happening.HOLE, Happening.CONTRADICTING):
-        return not event.stream.startswith("cam") and _lasted_s(event) > max_gap_s
+        return not event.stream.startswith(_OF_FRAMES) and _lasted_s(event) > max_gap_s
     return event.tears
 
 
 def _may_explain(event: StreamEvent) -> bool:
     """Whether an event, no doubt by itself, may be the cause of others: a camera's hole, or its clock leapt."""
-    return event.happening is Happening.HOLE and event.stream.startswith("cam") and _lasted_s(event) > LOST_S
+    return event.happening is Happening.HOLE and event.stream.startswith(_OF_FRAMES) and _lasted_s(event) > LOST_S
 
 
 def _is_dark(event: StreamEvent) -> bool:
