@@ -52,6 +52,11 @@ def test_an_expectation_that_hardly_a_track_meets_is_not_followed() -> None:
     assert confirmed(placed, first(90), by_those_left, CONFIG) is placed
 
 
+def test_a_filter_gains_nothing_by_tracks_that_agree_with_vision_too() -> None:
+    placed = Placed(PIXELS, first(95))
+    assert confirmed(placed, first(75), by_those_left, CONFIG) is placed
+
+
 def test_a_failed_motion_is_replaced_by_one_that_the_filter_supports() -> None:
     lost = Placed(PIXELS, first(5), "only 5 of 100 tracks agree on a motion")
     assert confirmed(lost, first(30), by_those_left, CONFIG).failure == ""

@@ -60,7 +60,8 @@ def test_the_verdict_is_the_first_line_printed_and_the_first_sentence_of_the_rep
     [
         ("turned", "the camera is turned by"),
         ("slow", "inertial samples come at"),
-        ("reconnected", "imu0: another motion than the camera sees from 5."),
+        ("reconnected", "imu0: another motion than the camera sees from 5.1"),
+        ("now in g", "imu0: another motion than the camera sees from 5.1"),
         ("imu hole 1.0", "imu0: rows are missing from 5.00 to 6.00 s"),
         ("in g", "gravity was not found"),
         ("dropped", "frames never arrived"),
@@ -71,8 +72,8 @@ def test_a_fault_is_named(tmp_path, fault, words):
     verdict = metrics["verdict"]
     assert verdict["state"] == "doubtful"
     assert any(words in reason for reason in verdict["reasons"]), verdict["reasons"]
-    if fault == "reconnected":  # and left out: followed, it leads 3 m away
-        assert max(one["ate_rmse_m"] for one in metrics["accuracy"].values()) < 0.5
+    if "another motion" in words:  # and left out: followed, it leads 3 and 38 m away
+        assert max(one["ate_rmse_m"] for one in metrics["accuracy"].values()) < 0.1
 
 
 def test_swapped_cameras_are_no_trusted_run(tmp_path):

@@ -20,6 +20,7 @@ DEGRADED_INLIERS = 40  # fewer: degraded
 _MIN_INLIER_RATIO = 0.3  # of the followed tracks; below, the agreement may be chance
 DEGRADED_INLIER_RATIO = 0.5  # of the followed tracks
 _CONTRADICTING_SHARE = 0.5  # of the tracks behind vision's motion are astray: it is not the camera's
+_KNOWN_SHARE = 0.5  # of the tracks behind the filter's motion are behind vision's, too: there are not two that move
 _MIN_EXPECTED_SHARE = 0.2  # of the tracks have to be where they are expected, or the expectation is wrong
 
 
@@ -93,7 +94,9 @@ def confirmed(placing: T, astray: NDArray[np.bool_], place: Callable[[Array], T]
         return placing
     other = place(np.where(astray[:, None], np.nan, placing.pixels))
     few = int(other.agreeing.sum()) < _MIN_EXPECTED_SHARE * placing.followed
-    return placing if few or other.failure else other
+    # of tracks that agree with both motions the filter's has gained none: misled, it would take what it just misses
+    known = not placing.failure and (other.agreeing & placing.agreeing).sum() > _KNOWN_SHARE * other.agreeing.sum()
+    return placing if few or known or other.failure else other
 
 
 def failure(tracks: int, followed: int, agree: int, converged: bool, least: int) -> str:

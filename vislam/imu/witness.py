@@ -30,7 +30,8 @@ _UNUSUAL = 10.0  # times the usual difference: vision errs by a few times of it 
 _TURN_RAD, _TURN_SHARE = np.deg2rad(0.5), 0.1  # that blurred images may be off by, and as much of the turn itself
 _MISTAKEN = 2.0  # times that without metres: a turn looks much like a motion to the side
 _FORCE_M_S2, _FORCE_SHARE = 1.0, 0.1  # the same of gravity: a place is off by a centimetre then
-_UNSEEN_M_S2 = 5.0  # of acceleration in half a second that is not seen, without metres: 2.5 m/s
+# without metres, mean acceleration over half a second is not seen: of so much, and of so many times the usual
+_UNSEEN_M_S2, _UNSEEN = 5.0, 5.0
 _CALM = 3.0  # times the usual difference up to which nothing has begun yet
 _ENOUGH_S = 0.5  # of contradiction more than of agreement, for samples not to be believed ...
 _MOST_WEIGHT = 4.0  # ... where they are off by no more than they may be; one by more counts at most that many times
@@ -143,7 +144,8 @@ class MotionWitness:
             if self._gravity:
                 off_m_s2 = float(np.linalg.norm(gravity - np.median(self._gravity, axis=0)))
                 may_m_s2 = _FORCE_M_S2 + _FORCE_SHARE * own_m_s2 if is_metric else _UNSEEN_M_S2
-                by_force, is_force_calm = self._off(off_m_s2, self._forces_m_s2, may_m_s2)
+                times = _UNUSUAL if is_metric else _UNSEEN
+                by_force, is_force_calm = self._off(off_m_s2, self._forces_m_s2, may_m_s2, times)
                 off, is_calm, tells = max(off, by_force), is_calm and is_force_calm, True
             if off <= 1.0 and self.until_ns is None:
                 self._gravity.append(gravity)
@@ -154,13 +156,13 @@ class MotionWitness:
         else:
             self._contradict(min(off, _MOST_WEIGHT))
 
-    def _off(self, off: float, usual: deque[float], least: float) -> tuple[float, bool]:
+    def _off(self, off: float, usual: deque[float], least: float, times: float = _UNUSUAL) -> tuple[float, bool]:
         """Return a difference over what it may be, above 1 where it is not usual, and whether nothing has begun yet.
 
         One that is usual is taken note of.
         """
         middle = median(np.array(usual)) if usual else np.inf
-        ratio = off / max(_UNUSUAL * middle, least) if len(usual) >= _FEWEST else 0.0
+        ratio = off / max(times * middle, least) if len(usual) >= _FEWEST else 0.0
         if ratio <= 1.0 and self.until_ns is None:
             usual.append(off)
         return ratio, off <= _CALM * middle
