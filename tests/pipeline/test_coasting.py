@@ -68,6 +68,16 @@ def test_a_submap_that_habit_ties_takes_its_velocity_on_and_what_is_not_known_of
     assert fresh.ahead(NS) is None
 
 
+def test_a_pose_known_worse_than_a_jerk_takes_a_body_tells_nothing_of_its_velocity() -> None:
+    coasting = Coasting()
+    for k in range(10):
+        assert coasting.follow(k * NS // 10, transform(np.eye(3), np.array([0.1 * k, 0.0, 0.0])), 0.01)
+    assert not coasting.follow(NS, transform(np.eye(3), np.array([0.1, 0.0, 0.0])), 0.6)
+    ahead = coasting.ahead(round(1.1 * NS))
+    assert ahead is not None
+    np.testing.assert_allclose(ahead[0][:3, 3], [0.2, 0.0, 0.0], atol=1e-6)
+
+
 def test_a_wild_motion_leaves_less_to_expect() -> None:
     calm, wild, rng = Coasting(), Coasting(), np.random.default_rng(2)
     T_calm, T_wild, speed = np.eye(4), np.eye(4), np.zeros(3)

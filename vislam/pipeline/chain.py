@@ -75,8 +75,9 @@ class KeyframeChain:
         if vo.T_keyframe_body is not None:
             self.T_vo_body = self._T_vo_keyframe @ scaled_motion(vo)
             if vo.has_scale:
-                self._placed = vo.T_keyframe_body, vo.covariance
-                self._coasting.follow(vo.t_ns, self.T_vo_body)
+                sigma_m = float(np.sqrt(np.linalg.eigvalsh(vo.covariance[3:, 3:])[-1]))
+                if self._coasting.follow(vo.t_ns, self.T_vo_body, sigma_m):
+                    self._placed = vo.T_keyframe_body, vo.covariance
         elif (coasted := self._coasted(vo.t_ns)) is not None:
             self.T_vo_body = self._T_vo_keyframe @ coasted[0]
 
@@ -129,10 +130,10 @@ class KeyframeChain:
 
     def extend(self, packet: KeyframePacket, T_odom_body: Array | None, state: NavState | None) -> None:
         """Make the keyframe of a packet the newest."""
-        if packet.begins_submap and packet.vo.T_keyframe_body is not None:
-            self._coasting.go_on(packet.keyframe.t_ns, self.T_vo_body)
-        elif packet.begins_submap:
+        if packet.begins_submap and packet.vo.T_keyframe_body is None:
             self._coasting.restart()
+        elif self._coasting.newest_ns != packet.keyframe.t_ns:
+            self._coasting.go_on(packet.keyframe.t_ns, self.T_vo_body)
         self._variance_m2 = _variance_m2(state)
         self.id, self.t_ns = packet.keyframe.id, packet.keyframe.t_ns
         self._rests, self.mag = True, None

@@ -37,10 +37,15 @@ class Coasting:
         self._sums, self._counts = np.zeros((len(_LAGS_S), 2)), np.zeros(len(_LAGS_S))
         self._recent = np.zeros((len(_LAGS_S), 2))
 
-    def follow(self, t_ns: int, T_vo_body: Array) -> None:
-        """Take a pose [4, 4] that was measured."""
-        if self._t_ns and t_ns <= self._t_ns[-1]:
-            return
+    @property
+    def newest_ns(self) -> int | None:
+        """When the body was last where it is known to be; None: never."""
+        return self._t_ns[-1] if self._t_ns else None
+
+    def follow(self, t_ns: int, T_vo_body: Array, sigma_m: float = 0.0) -> bool:
+        """Take a pose [4, 4] that was measured; one known worse than a jerk takes a body tells nothing, and is not."""
+        if self._t_ns and (t_ns <= self._t_ns[-1] or sigma_m > self.jerked_m(t_ns)):
+            return False
         self._learn(t_ns, T_vo_body)
         twist = np.zeros(6)
         if self._t_ns:
@@ -53,6 +58,7 @@ class Coasting:
         old = self._at_or_before(t_ns - round(2.0 * _LAGS_S[-1] * _NS))
         if old > 0:
             del self._t_ns[:old], self._poses[:old], self._twists[:old]
+        return True
 
     def restart(self) -> None:
         """Forget where the body was, not how it moves: poses from now on have nothing to do with those before."""
