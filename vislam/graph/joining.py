@@ -53,12 +53,17 @@ class Placement:
 
 
 class Waiting:
-    """Loops between submaps that are not joined."""
+    """Loops between submaps that are not joined.
+
+    Attributes:
+        undecided: what else is possible where loops agree on a place, by the group that they would place.
+    """
 
     def __init__(self, config: GraphConfig) -> None:
         """Start empty."""
         self._limit = chi_square_limit(config.loop_gate_probability, 6)
         self._edges: list[LoopModel] = []
+        self.undecided: dict[int, str] = {}
 
     @property
     def edges(self) -> list[LoopModel]:
@@ -96,6 +101,7 @@ class Waiting:
             tie: gives how good they are between keyframes of groups that are tied; None: none are.
             repeats_m: gives how far a place is from the next one that is known to look like it.
         """
+        self.undecided = {}
         pairs = [(submaps.group(e.record.from_id), submaps.group(e.record.to_id)) for e in self._edges]
         for pair in sorted({(min(p), max(p)) for p in pairs}):
             edges = [e for e, p in zip(self._edges, pairs, strict=True) if (min(p), max(p)) == pair]
@@ -106,37 +112,46 @@ class Waiting:
             ties = {} if tie is None else {r.id: tie(r.from_id, r.to_id) for r in tied}
             fitting = [e for e in edges if e.record.id not in ties or self._fits(e, ties[e.record.id], ends)]
             found = self._place(fitting, ends, known)
-            if found is not None and not self._has_rival(found, edges, ties, ends, repeats_m()):
-                self._edges = [e for e in self._edges if all(e is not other for other in found[1])]
-                return Placement(pair[1], *found)
+            if found is None:
+                continue
+            if rival := self._rival(found, edges, ties, ends, repeats_m()):
+                self.undecided[pair[1]] = rival
+                continue
+            self._edges = [e for e in self._edges if all(e is not other for other in found[1])]
+            return Placement(pair[1], *found)
         return None
 
     def _fits(self, edge: LoopModel, tie: Array, ends: _Ends) -> bool:
         """Return whether a loop agrees with the covariance [6, 6] of the tie between its ends."""
         return edge.chi2(*ends.of(edge, np.eye(4)), tie) < _TIE_LIMIT
 
-    def _has_rival(
+    def _rival(
         self,
         found: tuple[Array, list[LoopModel]],
         edges: list[LoopModel],
         ties: dict[int, Array],
         ends: _Ends,
         repeats_m: float,
-    ) -> bool:
-        """Return whether a loop speaks for another place within reach of the tie, or too few frames for this one.
+    ) -> str:
+        """Return which other place is within reach of the tie, or that too few frames agree on this one; else nothing.
 
         The farther the tie reaches the more frames have to agree: to each of them another panel may look most alike.
         """
         T, agreeing = found
         sigmas_m = [np.sqrt(np.linalg.eigvalsh(ties[e.record.id][3:, 3:])[-1]) for e in agreeing if e.record.id in ties]
+        alike = f"places that are {repeats_m:.1f} m apart look alike here"
         if not sigmas_m:
-            return bool(np.isfinite(repeats_m))
+            return alike if np.isfinite(repeats_m) else ""
         reach_m = _REACH_SIGMAS * min(sigmas_m)
-        more = sum(reach_m > step_m for step_m in _FRAME_REACH_M)
-        if len({e.record.to_id for e in agreeing}) < JOIN_FRAMES + more:
-            return True
-        others = [e for e in edges if e.record.has_scale and all(e is not one for one in agreeing)]
-        return repeats_m < reach_m or any(np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]) < reach_m for e in others)
+        need = JOIN_FRAMES + sum(reach_m > step_m for step_m in _FRAME_REACH_M)
+        if len({e.record.to_id for e in agreeing}) < need:
+            return f"{need} frames have to agree on a place, as it may be {reach_m:.1f} m from where habit has it"
+        for e in edges:
+            if e.record.has_scale and all(e is not one for one in agreeing):
+                off_m = float(np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]))
+                if off_m < reach_m:
+                    return f"keyframe {_places(agreeing[0])}, or {off_m:.1f} m from there, as {_places(e)}"
+        return alike if repeats_m < reach_m else ""
 
     def _place(
         self, edges: list[LoopModel], ends: _Ends, known: RelativeCovariance
@@ -194,6 +209,10 @@ class Waiting:
             if len(agreeing) > 2 and (best is None or _witnesses(agreeing) > _witnesses(best[1])):
                 best = T, agreeing
         return best
+
+
+def _places(edge: LoopModel) -> str:
+    return f"{edge.record.to_id} is at keyframe {edge.record.from_id}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -305,6 +324,9 @@ class Joining:
             self.count()
         ready = self._waiting.take_joined(self.submaps)
         touched += [m.record.id for m in ready]
+        for model in self.waiting:
+            ends = self.submaps.group(model.record.from_id), self.submaps.group(model.record.to_id)
+            loops.wait(model, self._waiting.undecided.get(max(ends), ""))
         return ready
 
     def _bring(self, found: Placement, notes: list[str]) -> None:

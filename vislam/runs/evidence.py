@@ -219,12 +219,18 @@ def whole_evidence(
         front,
         coverage=len(final) / max(frames_due, 1),
         submaps_apart=submaps_apart,
+        apart_reason=next((r.reason for r in reversed(reports) if _waits(r)), ""),
         sigma_m=log.worst_position_sigma_m,
         apart=_apart(log, final, states) if front.has_imu and front.is_started else None,
         loops_accepted=sum(report.decision is LoopDecision.ACCEPTED for report in reports),
         loops_contradicting=contradicting(reports),
         **keyframes,
     )
+
+
+def _waits(report: EdgeReport) -> bool:
+    """Whether a loop waits for its submap; what the graph tested has a distance."""
+    return report.decision is LoopDecision.PENDING and not isfinite(report.chi2)
 
 
 def contradicting(reports: Sequence[EdgeReport]) -> int:

@@ -105,10 +105,10 @@ class LoopSet:
             return None
         return LoopModel(record, self._config, self._lever_m)
 
-    def wait(self, model: LoopModel) -> None:
-        """Report that a loop waits for others, outside of this set."""
+    def wait(self, model: LoopModel, undecided: str = "") -> None:
+        """Report that a loop waits for others, outside of this set; `undecided` is between what, if some agree."""
         record = model.record
-        reason = "between submaps that are not joined, waits for loops of other frames that agree"
+        reason = f"between submaps that are not joined, {undecided or 'waits for loops of other frames that agree'}"
         ends = record.from_id, record.to_id
         self.ledger.begin(EdgeReport(record.id, *ends, float("nan"), 0.0, LoopDecision.PENDING, reason))
 

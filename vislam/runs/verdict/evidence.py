@@ -59,6 +59,7 @@ class Evidence:
     dark_s: float = 0.0  # longest time in which images showed nothing
     coverage: float = 1.0  # share of the frames that have a pose
     submaps_apart: int = 0  # submaps that no loop has joined with the first
+    apart_reason: str = ""  # why the newest loop to one of them did not
     # how a live run kept up
     frames_offered: int = 0  # by the camera
     frames_dropped: int = 0  # of them, that were not taken in time

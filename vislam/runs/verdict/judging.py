@@ -152,7 +152,8 @@ def _vision(e: Evidence, _: VerdictConfig) -> Iterator[str]:
         more = f", and {len(e.moving) - 1} times more" if len(e.moving) > 1 else ""
         yield f"{e.moving[0]}{more}: do not trust the way since then, and keep the camera off what moves"
     if e.submaps_apart:
-        yield f"{e.submaps_apart} submaps are joined with nothing: return to where the camera has been"
+        why = f" ({e.apart_reason})" if e.apart_reason else ""
+        yield f"{e.submaps_apart} submaps are joined with nothing{why}: return to where the camera has been"
 
 
 def _start(e: Evidence, _: VerdictConfig) -> Iterator[str]:
