@@ -125,20 +125,20 @@ class RunWatch:
         uniform: how long one camera has moved without showing scale.
     """
 
-    def __init__(self, config: InitConfig, knows_scale: bool, is_blind: bool = False) -> None:
-        """Start before the first frame; `knows_scale` is whether vision measures metres, `is_blind` no camera."""
+    def __init__(self, config: InitConfig, knows_scale: bool) -> None:
+        """Start before the first frame; `knows_scale` is whether vision measures metres."""
         self.counters = {
             "frames_lost": 0, "frames_degraded": 0, "longest_loss_ms": 0, "imu_outages": 0, "frames_at_rest": 0,
             "submaps": 1,
         }  # fmt: skip
         self.feed, self.tracks, self.uniform = CameraFeed(), NoiseUsed(), UniformMotion(config)
-        self._knows_scale, self._is_blind = knows_scale, is_blind
+        self._knows_scale = knows_scale
         self._lost_since_ns: int | None = None
         self._why_lost = Counter[str]()
 
     def see(self, frame: Frame) -> Frame:
         """Take a frame as the camera gave it; return it as it can be used: one that is frozen shows nothing."""
-        if self._is_blind:
+        if not frame.images and frame.tracks is None:  # there is no camera
             self.feed.count(frame)
             return frame
         seen = self.feed.add(frame)
@@ -157,7 +157,7 @@ class RunWatch:
         self.tracks.add(track.sigma_px, track.observations)
         if not self._knows_scale:
             self.uniform.add(span, state, at_rest)
-        counters, is_lost = self.counters, track.vo.tracking is Tracking.LOST and not self._is_blind
+        counters, is_lost = self.counters, track.vo.tracking is Tracking.LOST
         counters["frames_lost"] += is_lost
         if is_lost and (why := _NUMBER.sub("N", track.reason)):
             self._why_lost[why if len(self._why_lost) < _MOST_REASONS else ""] += 1

@@ -13,7 +13,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import TrackingLostError
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontMemory, StartFacts
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, VoMeasurement
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Tracking, VoMeasurement
 from vislam.ekf.tight import EarlyFrames, known_from
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
@@ -112,7 +112,7 @@ class Start:
     def begin_blind(self, state: NavState) -> VoMeasurement:
         """Take the filter's state at the first keyframe of a run without a camera; return the motion up to it: none."""
         self.first_state = state
-        return identity_motion(state.t_ns, 0, True, 0)
+        return replace(identity_motion(state.t_ns, 0, True, 0), tracking=Tracking.BLIND)
 
     def give_up(self) -> None:
         """Go on without gravity, by vision that is metric."""

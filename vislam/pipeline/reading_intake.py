@@ -11,7 +11,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core.chi_square import chi_square_limit
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState, Tracking
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState
 from vislam.core.readings import MotionReadings, OwnNow, OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, ImuNoise, preintegrate
@@ -373,7 +373,7 @@ def _with_motions(
     """
     if any(suite[name].sees_motion_only for name in begun):
         packet = replace(packet, filter_state=state)
-    if packet.begins_submap or packet.vo.tracking is not Tracking.LOST:
+    if packet.begins_submap or packet.vo.tracking.sees:
         return packet
     by_sensor: dict[str, list[PlacedReading]] = {}
     rest: list[PlacedReading] = []
