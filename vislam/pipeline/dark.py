@@ -43,14 +43,13 @@ class Waypoints:
 
     def wants(self, vo: VoMeasurement, is_keyframe: bool) -> bool:
         """Take note of a frame; return whether it is time for a keyframe, though vision gives none."""
-        if vo.tracking is Tracking.BLIND and self._since_ns is None:
-            self.sight, self._since_ns = Sight.DARK, vo.t_ns
-            return True
-        if vo.tracking.sees or is_keyframe or self._since_ns is None:
+        since_ns, is_blind = self._since_ns, vo.tracking is Tracking.BLIND
+        if vo.tracking.sees or is_keyframe or (since_ns is None and not is_blind):
             self._ends = self._ends or self.sight is Sight.DARK
-            self.sight, self._since_ns = Sight.SEEING, vo.t_ns
+            self.sight, self._since_ns = Sight.DARK if is_blind else Sight.SEEING, vo.t_ns
             return False
-        if vo.t_ns - self._since_ns < (_EVERY_NS if self.sight is Sight.DARK else _PATIENCE_NS) - _SLACK_NS:
+        patience_ns = (_EVERY_NS if self.sight is Sight.DARK else _PATIENCE_NS) - _SLACK_NS
+        if since_ns is not None and vo.t_ns - since_ns < patience_ns:
             self.sight = Sight.LOST if self.sight is Sight.SEEING else self.sight
             return False
         self.sight, self._since_ns = Sight.DARK, vo.t_ns

@@ -37,6 +37,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
     offered = [(ekf.get(first, 0), sum(ekf.get(name, 0) for name in others)) for first, *others in _VISION]
     evidence = Evidence(
         mode=report.mode,
+        is_alone=report.mode == "none" and not report.sensors,
         frames=feed.get("frames", 0),
         frames_lost=front.get("frames_lost", 0),
         longest_loss_s=1e-3 * front.get("longest_loss_ms", 0),

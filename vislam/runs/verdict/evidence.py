@@ -48,6 +48,7 @@ class Evidence:
     moving: tuple[str, ...] = ()  # events: something moved by itself before the camera
     # vision
     mode: str = ""
+    is_alone: bool = False  # the IMU: there is neither a camera nor a further sensor
     frames: int = 0
     frames_lost: int = 0
     longest_loss_s: float = 0.0

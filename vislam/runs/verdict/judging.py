@@ -195,7 +195,8 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
                 "explains: calibrate, or state more noise"
             )
     if e.sigma_m > _SIGMA_M:
-        yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst"
+        alone = ", for an IMU alone does not see the way: add wheels, fixes or a camera" if e.is_alone else ""
+        yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst{alone}"
     if e.uniform_s > _UNIFORM_S:
         yield (
             f"uniform motion for {e.uniform_s:.0f} s, in which one camera's scale is held by the IMU's biases alone: "
