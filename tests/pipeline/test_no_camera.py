@@ -81,6 +81,20 @@ def test_a_cart_finds_its_way_by_fixes_and_imu() -> None:
     assert off_m.max() < min(1.5, 4.0 * sigma_m.max())
 
 
+@pytest.mark.parametrize("start_s", [6.0, 10.0])
+def test_a_glide_that_fixes_see_is_not_taken_for_rest(start_s: float) -> None:
+    drive = Drive(FIXES, start_s)
+    assert drive.slam.front.start is None and not drive.keyframes
+    refused = drive.slam.front.report().counters["initialisation refused"]
+    assert refused["fixes"] > 0 and refused["motion"] > 0
+
+
+def test_fixes_too_rough_to_show_a_glide_are_not_waited_for() -> None:
+    rough = {"gnss": {"kind": "position", "simulated_hz": 1.0, "sigma_m": 1.5, "sigma_up_m": 3.0}}
+    start = Drive(rough).slam.front.start
+    assert start.status == "static" and start.reason == "at rest for 0.80 s"
+
+
 def test_a_cart_in_motion_begins_by_the_speed_of_its_wheels() -> None:
     drive = Drive(WHEELS, start_s=15.0)
     states = drive.slam.back.graph.states()

@@ -32,6 +32,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.imu import ImuNoise
+from vislam.pipeline.blind_start import Said
 from vislam.pipeline.chain import KeyframeChain, believed, seek_place, torn
 from vislam.pipeline.dark import Waypoints, unseen_keyframe
 from vislam.pipeline.front_report import FrontReport, RunWatch, report_of
@@ -88,7 +89,7 @@ class Front:
             self.inertial = Inertial(config, rig, noise, suite)
             self.gravity = GravityWait(
                 config, rig, noise, self.begun, self._chain, self.inertial, self.frontend.knows_scale,
-                lambda: None if self.readings is None else self.readings.moves(),
+                lambda from_ns: Said() if self.readings is None else self.readings.said(from_ns),
             )  # fmt: skip
         self.readings: ReadingIntake | None = None
         if suite is not None and len(suite):
