@@ -29,33 +29,16 @@ _PATIENCE_S = 5.0  # of stillness in which fixes may show a glide: who begins at
 _NS = 1_000_000_000
 
 
-class SpeedByFixes(NamedTuple):
-    """What fixes say of an even motion."""
-
-    speed_m_s: float
-    sigma_m_s: float  # of its horizontal axes
-    length_s: float  # from the first fix to the last
-    chi2: float  # of three degrees, that it is none
-
-    @property
-    def glides(self) -> bool:
-        """Whether the body moves."""
-        return self.speed_m_s > _GLIDE_M_S and self.chi2 > chi_square_limit(_CERTAIN, 3)
-
-    def shows(self, after_s: float) -> bool:
-        """Whether a body that moves is seen to after a time: what a line's slope is known to falls by 3/2 powers."""
-        return 3.0 * self.sigma_m_s * (self.length_s / max(after_s, self.length_s)) ** 1.5 < _GLIDE_M_S
-
-
 class Said(NamedTuple):
     """What further sensors say of the motion before the filter began."""
 
     moves: bool | None = None  # by sensors of motion; None: no reading
-    fixes: SpeedByFixes | None = None  # None: there are none
+    doubt: str = ""  # why still samples are no rest yet, by fixes; empty: they have no objection
+    is_sure: bool = False  # of that: more of them would not change it
 
 
 def said_of(readings: Iterable[Reading], suite: Suite, from_ns: int) -> Said:
-    """Return what sensors of motion said last, and what the fixes since a time say that know the speed best."""
+    """Return what sensors of motion said last, or where none did, what the best fixes since a time say."""
     last: dict[str, Reading] = {}
     fixes: dict[str, list[Reading]] = {}
     for one in readings:
@@ -63,10 +46,10 @@ def said_of(readings: Iterable[Reading], suite: Suite, from_ns: int) -> Said:
             last[one.sensor] = one
         elif suite[one.sensor].gives_fixes and one.t_ns >= from_ns:
             fixes.setdefault(one.sensor, []).append(one)
-    apart = {name: of_one for name, of_one in fixes.items() if len({one.t_ns for one in of_one}) > 1}
-    speeds = [_speed(of_one, suite[name]) for name, of_one in apart.items()]
-    moves = any(_shows_motion(one, suite) for one in last.values()) if last else None
-    return Said(moves, min(speeds, key=lambda speed: speed.sigma_m_s, default=None))
+    if last:
+        return Said(any(_shows_motion(one, suite) for one in last.values()))
+    objections = (_objection(of_one, suite[name]) for name, of_one in fixes.items())
+    return Said(None, *min(objections, default=(0.0, "", False))[1:])
 
 
 def _shows_motion(reading: Reading, suite: Suite) -> bool:
@@ -81,17 +64,21 @@ def _shows_motion(reading: Reading, suite: Suite) -> bool:
         return False
 
 
-def _speed(readings: Sequence[Reading], sensor: Sensor) -> SpeedByFixes:
-    """Return the slope of a line through the fixes of a sensor, of two times at least, weighted by their variances."""
+def _objection(readings: Sequence[Reading], sensor: Sensor) -> tuple[float, str, bool]:
+    """Return how well fixes know the speed (m/s), as the slope of a line, and what `Said` has of it."""
     noise = [sensor.noise(one.values) if one.covariance is None else one.covariance for one in readings]
     weights = 1.0 / np.maximum(np.array([np.diag(covariance) for covariance in noise]), 1e-12)
     t_s = np.array([one.t_ns - readings[0].t_ns for one in readings])[:, None] * 1e-9
     off_s = t_s - (weights * t_s).sum(axis=0) / weights.sum(axis=0)
     information = np.maximum((weights * off_s**2).sum(axis=0), 1e-12)
     slope = (weights * off_s * np.array([one.values for one in readings])).sum(axis=0) / information
-    sigma_m_s = float(1.0 / np.sqrt(information[:2].min()))
-    chi2 = float((slope**2 * information).sum())
-    return SpeedByFixes(float(np.linalg.norm(slope)), sigma_m_s, float(np.ptp(t_s)), chi2)
+    sigma_m_s, speed_m_s = float(1.0 / np.sqrt(information[:2].min())), float(np.linalg.norm(slope))
+    if speed_m_s > _GLIDE_M_S and (slope**2 * information).sum() > chi_square_limit(_CERTAIN, len(slope)):
+        return sigma_m_s, f"samples are of rest, but fixes move at {speed_m_s:.1f} m/s: stand still to begin", True
+    later_m_s = sigma_m_s * min(float(np.ptp(t_s)) / _PATIENCE_S, 1.0) ** 1.5
+    if 3.0 * later_m_s < _GLIDE_M_S <= 3.0 * sigma_m_s:
+        return sigma_m_s, "fixes do not distinguish rest from a glide yet: stand still longer", False
+    return sigma_m_s, "", False
 
 
 class BlindStart:
@@ -136,7 +123,8 @@ class BlindStart:
         since_ns = self._still_since_ns or int(whole.t_ns[0])
         self._still_since_ns, said = since_ns if still else None, self._said(since_ns)
         if still and not said.moves:
-            return self._waiting_for(said) or self._from_rest(whole, length_s)
+            is_open = bool(said.doubt) and (said.is_sure or vo.t_ns - since_ns < _PATIENCE_S * _NS)
+            return self._refused("fixes", said.doubt) if is_open else self._from_rest(whole, length_s)
         if said.moves is None:
             reason = "the body moves, and no sensor measures its speed: begin at rest, or give wheels or another speed"
             return self._refused("motion", reason)
@@ -144,20 +132,6 @@ class BlindStart:
 
     def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
         """Do nothing: there is no camera whose clock could be off."""
-
-    def _waiting_for(self, said: Said) -> Initialisation | None:
-        """Refuse a rest that fixes contradict, or will soon have confirmed; None where they do neither."""
-        fixes = said.fixes
-        if fixes is None or said.moves is False:
-            return None
-        if fixes.glides:
-            reason = f"samples are those of rest, but fixes move at {fixes.speed_m_s:.1f} m/s: stand still to begin"
-            return self._refused("motion", reason)
-        if fixes.shows(fixes.length_s) or not fixes.shows(_PATIENCE_S):
-            return None
-        return self._refused(
-            "fixes", f"fixes of {fixes.length_s:.1f} s do not distinguish rest from a glide: stand still longer"
-        )
 
     def _from_rest(self, span: ImuSpan, length_s: float) -> Initialisation:
         samples = [ImuSample(*row) for row in zip(span.t_ns.tolist(), span.gyro_rad_s, span.accel_m_s2, strict=True)]

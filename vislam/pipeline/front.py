@@ -79,7 +79,7 @@ class Front:
         refuse_without_scale(config.ekf, self.frontend.knows_scale, noise is not None)
         self.camera_clock = CameraClock(config.init)
         self.begun = Start(noise is not None)
-        self.watch = RunWatch(config.init, self.frontend.knows_scale)
+        self.watch = RunWatch(config.init, self.frontend.knows_scale, suite)
         self._T_upright = _upright(rig)
         most_m = np.inf if rig.is_blind else config.ekf.submap_sigma_m  # no loop would join submaps
         self._chain = KeyframeChain(self._T_upright if noise is None else np.eye(4), most_m)
@@ -120,6 +120,7 @@ class Front:
 
     def add(self, value: ImuSample | MagSample | Reading) -> None:
         """Take a sample of an inertial sensor, or a reading of another; the filter predicts at once."""
+        self.watch.hear(value)
         if isinstance(value, MagSample):
             self._chain.mag = value
             if self.readings is not None:
@@ -179,9 +180,7 @@ class Front:
         self._last_frame_t_ns = frame.t_ns + shift_ns
         corrections = [] if self._imu is None else self._imu.filtering.take_applied()
         shown = None if estimate is None else estimate.shown(frame.t_ns, self._published)
-        return FrontStep(
-            frame, track, shown, estimate, state, self._chain.id, T_keyframe_body, ready, corrections
-        )  # fmt: skip
+        return FrontStep(frame, track, shown, estimate, state, self._chain.id, T_keyframe_body, ready, corrections)
 
     def take_applied_readings(self) -> list[AppliedReading]:
         """Return what the filter was given of further sensors since the last call."""
