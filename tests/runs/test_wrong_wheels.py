@@ -69,6 +69,8 @@ def test_wheels_as_stated_raise_no_doubt(tmp_path, seed):
 
 def test_turns_and_delays_within_what_any_drive_shows_are_no_doubt():
     own = {"track_width_m": (0.5, 0.015, Moved(0.02, 0.005))}
-    for turn, delay, reasons in ((0.08, 0.06, 0), (0.2, 0.06, 1), (0.08, -0.2, 1), (-2.0, 0.0, 1)):
-        evidence = Evidence(driven=(Driven("wheels", own, Moved(turn, 0.01), Moved(delay, 0.01)),))
+    for turn, slip, delay, reasons in (
+        (0.08, 0.05, 0.06, 0), (0.2, 0.05, 0.06, 1), (0.2, 0.3, 0.06, 0), (0.08, 0.05, -0.2, 1), (-2.0, 0.3, 0.0, 1),
+    ):  # fmt: skip
+        evidence = Evidence(driven=(Driven("wheels", own, Moved(turn, 0.01), slip, Moved(delay, 0.01)),))
         assert len(judge(evidence, Config().verdict).reasons) == reasons

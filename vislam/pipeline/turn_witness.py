@@ -101,6 +101,7 @@ class TurnWitness:
         return {
             "factor": float(solved[best, 1]), "factor_sigma": float(np.sqrt(variance * np.linalg.inv(N[best])[1, 1])),
             "delay_s": float(delay_s), "delay_sigma_s": delay_sigma_s,
+            "slip": getattr(getattr(self._sensor, "settings", None), "turn_slip", 0.0),
             "explained": float(1.0 - left[best] / max(self._squares - self._sum**2 / n, 1e-12)),
         }  # fmt: skip
 

@@ -144,7 +144,7 @@ def _driven(name: str, entry: dict[str, Any]) -> Driven:
     if turns.get("explained", 0.0) < _EXPLAINED:
         return Driven(name, own)
     turn = Moved(turns["factor"] - 1.0, turns["factor_sigma"])
-    return Driven(name, own, turn, Moved(turns["delay_s"], turns["delay_sigma_s"]))
+    return Driven(name, own, turn, turns["slip"], Moved(turns["delay_s"], turns["delay_sigma_s"]))
 
 
 def _calibration(learned: dict[str, float]) -> dict[str, Any]:

@@ -37,6 +37,7 @@ class Driven:
     name: str
     own: dict[str, tuple[float, float, Moved | None]]  # by variable: what was stated, its sigma, what was measured
     turn: Moved | None = None  # of its turns over the gyroscope's, from 1
+    slip: float = 0.0  # in turns, as stated
     delay: Moved | None = None  # s, of its stamps behind the IMU's
 
 

@@ -15,7 +15,7 @@ from vislam.runs.verdict.evidence import Evidence, Moved
 # of the camera's clock as given: drivers that stamp on arrival are off by up to 30 ms
 _CLOCK_SIGMA_S = 0.015
 _STAMP_SIGMA_S = 0.03  # of readings of what drives: stamped on arrival, and averages over their period
-_DRIVEN_SIGMA = 0.04  # relative, of turns by wheels: tracks and radii are known to 3 % each
+_DRIVEN_SIGMA = 0.04  # relative, of turns by wheels: tracks and radii are known to 3 % each; or the slip stated
 _TURN_SCALE_SIGMA = 0.004  # relative, of focal length (Kalibr: 0.2 %) and of a calibrated gyro (0.3 %)
 _FORCE_SCALE_SIGMA = 0.01  # relative, of accelerometer and of baseline or depth, all calibrated
 # white noise of inertial data, in the quietest half second; what is stated does not matter, for estimators learn it.
@@ -285,7 +285,7 @@ def _driven(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             )
         if one.turn is not None and one.turn.by < -1.0 - 4.0 * one.turn.sigma:
             yield f"{one.name} turn the other way than the gyroscope: swap left and right, or check the IMU's axes"
-        elif one.turn is not None and _beyond(one.turn, _DRIVEN_SIGMA, 1, c):
+        elif one.turn is not None and _beyond(one.turn, max(_DRIVEN_SIGMA, one.slip), 1, c):
             yield f"{one.name} turn by {_percent(one.turn.by)} angles than the gyroscope: measure track and radii"
         for variable, (stated, sigma, moved) in one.own.items():
             if moved is not None and _beyond(moved, sigma, 1, c):
