@@ -40,7 +40,7 @@ class Slam:
         self.clock = StageClock()
         self.front = Front(config, rig, noise, self.clock, suite)
         self._intake = KeyframeIntake(rig, self.front, self.clock, suite, labeller)
-        self._in_map = InMap(config.publish, rig.is_blind)
+        self._in_map = InMap(config.publish)
         self._frames: deque[Frame] = deque()
         self._silence = SilentCamera(rig) if noise is not None and (rig.is_blind or suite) else None
 

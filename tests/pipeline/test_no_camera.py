@@ -11,10 +11,15 @@ from vislam.config import load
 from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert
+from vislam.core.messages import ImuSpan
+from vislam.core.readings import Reading
+from vislam.frontend.result import lost_motion
+from vislam.pipeline.blind_start import BlindStart, Said, said_of
 from vislam.pipeline.dark import SilentCamera
 from vislam.pipeline.settings import derived
 from vislam.runs.further_sensors import FurtherReadings
 from vislam.runs.sources import open_source
+from vislam.sensors import Suite, kind_class
 from vislam.sensors.toml import sensor_setup
 from vislam.slam import Slam
 
@@ -79,6 +84,34 @@ def test_a_cart_finds_its_way_by_fixes_and_imu() -> None:
     off_m, sigma_m = Drive(FIXES).errors()
     print(off_m.max(), sigma_m.max())
     assert off_m.max() < min(1.5, 4.0 * sigma_m.max())
+
+
+@pytest.mark.parametrize("start_s", [6.0, 10.0])
+def test_a_glide_that_fixes_see_is_not_taken_for_rest(start_s: float) -> None:
+    drive = Drive(FIXES, start_s)
+    assert drive.slam.front.start is None and not drive.keyframes
+    assert drive.slam.front.report().counters["initialisation refused"]["fixes"] > 0
+
+
+def test_fixes_too_rough_to_show_a_glide_are_not_waited_for() -> None:
+    rough = {"gnss": {"kind": "position", "simulated_hz": 1.0, "sigma_m": 1.5, "sigma_up_m": 3.0}}
+    start = Drive(rough).slam.front.start
+    assert start.status == "static" and start.reason == "at rest for 0.80 s"
+
+
+def test_fixes_that_fall_silent_are_not_waited_for() -> None:
+    suite = Suite({"gnss": kind_class("position")()})
+    assert said_of([], suite, 0) == Said()
+    early = [Reading("gnss", k * SECOND_NS // 5, np.zeros(3)) for k in range(4)]
+    said = said_of(early, suite, 0)
+    assert said.doubt and not said.is_sure
+    recording = open_source("points:cart-drive,rig=none,duration_s=1")
+    start = BlindStart(load(None, {}).init, recording.imu_noise, 9.81, lambda _: said)
+    level = np.tile([0.0, 0.0, 9.81], (21, 1))
+    for k in range(60):
+        t_ns = k * SECOND_NS // 10 + np.arange(21, dtype=np.int64) * (SECOND_NS // 200)
+        found = start.add(ImuSpan(t_ns, np.zeros((21, 3)), level), lost_motion(int(t_ns[-1]), -1, True), True)
+    assert found.status == "static" and 40 < start.refusals["fixes"] < 50
 
 
 def test_a_cart_in_motion_begins_by_the_speed_of_its_wheels() -> None:

@@ -33,6 +33,12 @@ class Tracking(StrEnum):
     OK = "ok"
     DEGRADED = "degraded"
     LOST = "lost"
+    BLIND = "blind"  # there is no camera, which could lose anything
+
+    @property
+    def sees(self) -> bool:
+        """Whether vision measured a motion."""
+        return self in (Tracking.OK, Tracking.DEGRADED)
 
 
 class Localisation(StrEnum):
@@ -141,7 +147,7 @@ class VoMeasurement:
 
     t_ns: int
     keyframe_id: int
-    T_keyframe_body: Array | None  # [4, 4]; None when lost
+    T_keyframe_body: Array | None  # [4, 4]; None when lost or blind
     covariance: Array  # [6, 6]; unscaled translation: covariance of the unit direction, singular along it
     has_scale: bool
     tracking: Tracking

@@ -15,7 +15,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core.geometry import invert, transform
-from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking
+from vislam.core.messages import Array, ImuSample, MagSample, NavState
 from vislam.ekf.correction import AppliedReading, Correction, Hint
 from vislam.ekf.loose.filter import Ekf
 from vislam.hw.health import Health
@@ -143,7 +143,7 @@ class FastPath:
     def _take(self, message: ToFast) -> None:
         if isinstance(message, Correction):
             answer = message.apply(self._ekf)
-            is_seen = message.vo.tracking is not Tracking.LOST
+            is_seen = message.vo.tracking.sees
             self._follow_vision(is_seen, answer.accepted, is_seen and not np.isnan(answer.nis) and not answer.accepted)
             self._at_rest = message.at_rest
         elif isinstance(message, AppliedReading):

@@ -17,7 +17,6 @@ from vislam.core.messages import (
     KeyframePacket,
     MagSample,
     NavState,
-    Tracking,
     VoMeasurement,
     no_observations,
 )
@@ -71,7 +70,7 @@ class KeyframeChain:
 
     def follow(self, vo: VoMeasurement, at_rest: bool) -> None:
         """Take a frame's motion since the keyframe, and whether the body rested over it."""
-        self._rests, self._is_lost = self._rests and at_rest, vo.tracking is Tracking.LOST
+        self._rests, self._is_lost = self._rests and at_rest, not vo.tracking.sees
         if vo.T_keyframe_body is not None:
             self.T_vo_body = self._T_vo_keyframe @ scaled_motion(vo)
             if vo.has_scale:
@@ -86,7 +85,7 @@ class KeyframeChain:
 
         After a loss, habit decides; while tracks are followed a body may be jerked out of it, but hardly thrown.
         """
-        if vo.tracking is Tracking.LOST or vo.T_keyframe_body is None or not vo.has_scale:
+        if not vo.tracking.sees or vo.T_keyframe_body is None or not vo.has_scale:
             return False
         coasted = self._coasted(vo.t_ns)
         if coasted is None or vo.keyframe_id != self.id:
@@ -122,9 +121,9 @@ class KeyframeChain:
             state: the filter's at the keyframe.
             offset_s: by which the camera's stamp was moved.
         """
-        begins_submap = track.vo.tracking is Tracking.LOST and not self.is_bridged(keyframe.t_ns, imu, state)
-        vo = self._with_habit(track.vo) if begins_submap and imu is None else track.vo
-        begins_submap = begins_submap or keyframe.id == self.first_id > 0
+        is_led = self.id < 0 or track.vo.tracking.sees or self.is_bridged(keyframe.t_ns, imu, state)
+        vo = track.vo if is_led or imu is not None else self._with_habit(track.vo)
+        begins_submap = not is_led or keyframe.id == self.first_id > 0
         at_rest = self._rests and self.id >= 0
         return KeyframePacket(keyframe, vo, track.observations, imu, self.mag, at_rest, offset_s, begins_submap)
 

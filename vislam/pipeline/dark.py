@@ -28,30 +28,28 @@ class Waypoints:
     """Decides when a frame without sight is to be a keyframe: often enough for the path between two by inertial data.
 
     Often enough also for the memory of these data, which is `imu.buffer_s`. Only as long as the filter knows where the
-    body is: what its sensors leave in doubt is for loops to join, as after any loss of sight.
+    body is: what its sensors leave in doubt is for loops to join, as after any loss of sight. Without a camera it is
+    dark from the start, and keyframes always go on.
 
     Attributes:
         sight: now.
-        is_blind: there is no camera, and no loop would join what the filter leaves in doubt: keyframes always go on.
     """
 
-    def __init__(self, rig: Rig) -> None:
-        """Start before the first frame; without a camera it is dark from the start."""
-        self.sight = Sight.DARK if rig.is_blind else Sight.SEEING
-        self.is_blind = rig.is_blind
+    def __init__(self) -> None:
+        """Start before the first frame."""
+        self.sight = Sight.SEEING
         self._since_ns: int | None = None  # the last frame that was placed, or waypoint; None: no frame yet
         self._ends = False  # whether sight is back since `marked`
 
     def wants(self, vo: VoMeasurement, is_keyframe: bool) -> bool:
         """Take note of a frame; return whether it is time for a keyframe, though vision gives none."""
-        if self.is_blind and self._since_ns is None:
-            self._since_ns = vo.t_ns
-            return True
-        if vo.tracking is not Tracking.LOST or is_keyframe or self._since_ns is None:
+        since_ns, is_blind = self._since_ns, vo.tracking is Tracking.BLIND
+        if vo.tracking.sees or is_keyframe or (since_ns is None and not is_blind):
             self._ends = self._ends or self.sight is Sight.DARK
-            self.sight, self._since_ns = Sight.SEEING, vo.t_ns
+            self.sight, self._since_ns = Sight.DARK if is_blind else Sight.SEEING, vo.t_ns
             return False
-        if vo.t_ns - self._since_ns < (_EVERY_NS if self.sight is Sight.DARK else _PATIENCE_NS) - _SLACK_NS:
+        patience_ns = (_EVERY_NS if self.sight is Sight.DARK else _PATIENCE_NS) - _SLACK_NS
+        if since_ns is not None and vo.t_ns - since_ns < patience_ns:
             self.sight = Sight.LOST if self.sight is Sight.SEEING else self.sight
             return False
         self.sight, self._since_ns = Sight.DARK, vo.t_ns

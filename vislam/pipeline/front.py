@@ -23,6 +23,7 @@ from vislam.core.messages import (
     MagSample,
     NavState,
     NoiseScale,
+    Tracking,
 )
 from vislam.core.readings import Reading
 from vislam.ekf import Hint
@@ -31,6 +32,7 @@ from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.imu import ImuNoise
+from vislam.pipeline.blind_start import Said
 from vislam.pipeline.chain import KeyframeChain, believed, seek_place, torn
 from vislam.pipeline.dark import Waypoints, unseen_keyframe
 from vislam.pipeline.front_report import FrontReport, RunWatch, report_of
@@ -77,7 +79,7 @@ class Front:
         refuse_without_scale(config.ekf, self.frontend.knows_scale, noise is not None)
         self.camera_clock = CameraClock(config.init)
         self.begun = Start(noise is not None)
-        self.watch = RunWatch(config.init, self.frontend.knows_scale, rig.is_blind)
+        self.watch = RunWatch(config.init, self.frontend.knows_scale, suite)
         self._T_upright = _upright(rig)
         most_m = np.inf if rig.is_blind else config.ekf.submap_sigma_m  # no loop would join submaps
         self._chain = KeyframeChain(self._T_upright if noise is None else np.eye(4), most_m)
@@ -87,12 +89,12 @@ class Front:
             self.inertial = Inertial(config, rig, noise, suite)
             self.gravity = GravityWait(
                 config, rig, noise, self.begun, self._chain, self.inertial, self.frontend.knows_scale,
-                lambda: None if self.readings is None else self.readings.moves(),
+                lambda from_ns: Said() if self.readings is None else self.readings.said(from_ns),
             )  # fmt: skip
         self.readings: ReadingIntake | None = None
         if suite is not None and len(suite):
             self.readings = ReadingIntake.of_run(config, suite, noise, self.inertial)
-        self._clock, self._waypoints, self._published = clock, Waypoints(rig), in_odom(config)
+        self._clock, self._waypoints, self._published = clock, Waypoints(), in_odom(config)
         self._last_frame_t_ns: int | None = None
 
     def resume(self, memory: FrontMemory) -> None:
@@ -118,6 +120,7 @@ class Front:
 
     def add(self, value: ImuSample | MagSample | Reading) -> None:
         """Take a sample of an inertial sensor, or a reading of another; the filter predicts at once."""
+        self.watch.hear(value)
         if isinstance(value, MagSample):
             self._chain.mag = value
             if self.readings is not None:
@@ -177,9 +180,7 @@ class Front:
         self._last_frame_t_ns = frame.t_ns + shift_ns
         corrections = [] if self._imu is None else self._imu.filtering.take_applied()
         shown = None if estimate is None else estimate.shown(frame.t_ns, self._published)
-        return FrontStep(
-            frame, track, shown, estimate, state, self._chain.id, T_keyframe_body, ready, corrections
-        )  # fmt: skip
+        return FrontStep(frame, track, shown, estimate, state, self._chain.id, T_keyframe_body, ready, corrections)
 
     def take_applied_readings(self) -> list[AppliedReading]:
         """Return what the filter was given of further sensors since the last call."""
@@ -212,7 +213,7 @@ class Front:
         """Return where visual odometry has a frame; as a keyframe also where only the filter knows the way."""
         track = self.frontend.track(frame, since.unbiased, since.gyro_sigma_rad_s, since.T_last_now)
         track = believed(track, self._chain, self.frontend) if self._imu is None else track
-        track = self._as_waypoint(frame, self._linked(frame, track))
+        track = self._as_waypoint(frame, _told_blind(self._linked(frame, track), self.frontend.mode))
         return replace(track, vo=self.camera_clock.loosened(track.vo, since.span, since.state))
 
     def _linked(self, frame: Frame, track: TrackResult) -> TrackResult:
@@ -229,7 +230,7 @@ class Front:
 
     def _as_waypoint(self, frame: Frame, track: TrackResult) -> TrackResult:
         """Return the track, as that of a keyframe where vision gives none for long and the filter knows the way."""
-        imu, chain, is_blind = self._imu, self._chain, self._waypoints.is_blind
+        imu, chain, is_blind = self._imu, self._chain, track.vo.tracking is Tracking.BLIND
         if (self.readings is None and not is_blind) or imu is None or self.begun.holds_keyframes:
             return track
         state = imu.filtering.ekf.state_at(frame.t_ns)
@@ -240,7 +241,7 @@ class Front:
         self.watch.counters["waypoints"] = self.watch.counters.get("waypoints", 0) + 1
         keyframe = unseen_keyframe(chain.id + 1, frame)
         seek_place(self.frontend, keyframe.id + 1)
-        lost = lost_motion(frame.t_ns, chain.id, track.vo.has_scale)
+        lost = replace(lost_motion(frame.t_ns, chain.id, track.vo.has_scale), tracking=track.vo.tracking)
         return replace(track, keyframe=keyframe, vo=self.begun.begin_blind(state) if chain.id < 0 else lost)
 
     def _estimate(self, track: TrackResult, since: Since, at_rest: bool) -> tuple[Estimate | None, NavState | None]:
@@ -296,6 +297,11 @@ class Front:
     def report(self) -> FrontReport:
         """Return what there is to say of the run so far."""
         return report_of(self)
+
+
+def _told_blind(track: TrackResult, mode: str) -> TrackResult:
+    """Return the track, as that of no camera where the front end has none."""
+    return replace(track, vo=replace(track.vo, tracking=Tracking.BLIND)) if mode == "none" else track
 
 
 def _upright(rig: Rig) -> Array:

@@ -13,7 +13,8 @@ from vislam.config import EkfConfig, InitConfig
 from vislam.core.geometry import so3_exp
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import StartFacts
-from vislam.core.messages import Array, Frame, ImuSpan, NavState, Tracking
+from vislam.core.messages import Array, Frame, ImuSample, ImuSpan, MagSample, NavState, Tracking
+from vislam.core.readings import Reading
 from vislam.core.streams import StreamEvent
 from vislam.frontend import TrackResult, knows_scale
 from vislam.frontend.camera_clock import CameraClock
@@ -23,6 +24,8 @@ from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.imu import InertialCondition, NoiseRatios
 from vislam.pipeline.dark import dark
 from vislam.pipeline.gravity import Phase
+from vislam.pipeline.turn_witness import turn_witnesses
+from vislam.sensors import Suite
 from vislam.trajectory import Alignment, gauge_alignment
 
 if TYPE_CHECKING:
@@ -123,22 +126,28 @@ class RunWatch:
         feed: what the camera delivered.
         tracks: what was seen of their noise.
         uniform: how long one camera has moved without showing scale.
+        drives: for each sensor of what drives, whether it turns as the gyroscope has it.
     """
 
-    def __init__(self, config: InitConfig, knows_scale: bool, is_blind: bool = False) -> None:
-        """Start before the first frame; `knows_scale` is whether vision measures metres, `is_blind` no camera."""
+    def __init__(self, config: InitConfig, knows_scale: bool, suite: Suite | None = None) -> None:
+        """Start before the first frame; `knows_scale` is whether vision measures metres, `suite` further sensors."""
         self.counters = {
             "frames_lost": 0, "frames_degraded": 0, "longest_loss_ms": 0, "imu_outages": 0, "frames_at_rest": 0,
             "submaps": 1,
         }  # fmt: skip
         self.feed, self.tracks, self.uniform = CameraFeed(), NoiseUsed(), UniformMotion(config)
-        self._knows_scale, self._is_blind = knows_scale, is_blind
+        self._knows_scale, self.drives = knows_scale, turn_witnesses(suite)
         self._lost_since_ns: int | None = None
         self._why_lost = Counter[str]()
 
+    def hear(self, value: ImuSample | MagSample | Reading) -> None:
+        """Take what comes of any sensor but the camera."""
+        for one in self.drives:
+            one.hear(value)
+
     def see(self, frame: Frame) -> Frame:
         """Take a frame as the camera gave it; return it as it can be used: one that is frozen shows nothing."""
-        if self._is_blind:
+        if not frame.images and frame.tracks is None:  # there is no camera
             self.feed.count(frame)
             return frame
         seen = self.feed.add(frame)
@@ -157,7 +166,7 @@ class RunWatch:
         self.tracks.add(track.sigma_px, track.observations)
         if not self._knows_scale:
             self.uniform.add(span, state, at_rest)
-        counters, is_lost = self.counters, track.vo.tracking is Tracking.LOST and not self._is_blind
+        counters, is_lost = self.counters, track.vo.tracking is Tracking.LOST
         counters["frames_lost"] += is_lost
         if is_lost and (why := _NUMBER.sub("N", track.reason)):
             self._why_lost[why if len(self._why_lost) < _MOST_REASONS else ""] += 1
@@ -200,7 +209,7 @@ def report_of(front: Front) -> FrontReport:
         front.frontend.mode, None, front.start, begun.refusal, _counters(front), {}, [], {},
         front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, told_noise=front.noise,
         track_noise=front.watch.tracks.summary(_given_px(front)),
-        sensors={} if front.readings is None else front.readings.report(),
+        sensors=_sensors(front),
         first_t_ns=front.watch.feed.first_t_ns or 0, lost_reason=front.watch.lost_reason,
         is_confirmed=not (front.gravity and front.gravity.counters.get("start_unconfirmed")),
         events=tuple(sorted(events, key=lambda event: event.from_ns)),
@@ -215,6 +224,14 @@ def report_of(front: Front) -> FrontReport:
         report, nis=imu.filtering.ekf.nis_statistics, noise_warnings=floor.warnings(_NOISE_TOLERANCE),
         imu_noise=floor.summary(), noise_ratios=floor.ratios,
     )  # fmt: skip
+
+
+def _sensors(front: Front) -> dict[str, dict[str, Any]]:
+    """Return what is known of further sensors, by name."""
+    found = {} if front.readings is None else front.readings.report()
+    for one in front.watch.drives:
+        found[one.name] |= one.report()
+    return found
 
 
 def _counters(front: Front) -> dict[str, dict[str, int]]:

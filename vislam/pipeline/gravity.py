@@ -13,13 +13,13 @@ from vislam.core.camera import Rig
 from vislam.core.errors import TrackingLostError
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import FrontMemory, StartFacts
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, VoMeasurement
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Tracking, VoMeasurement
 from vislam.ekf.tight import EarlyFrames, known_from
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion
 from vislam.frontend.start import Initialisation, Initialiser, level_at_once, moved_to
-from vislam.pipeline.blind_start import BlindStart
+from vislam.pipeline.blind_start import BlindStart, Said
 from vislam.pipeline.chain import KeyframeChain
 from vislam.pipeline.inertial_stages import Inertial
 from vislam.trajectory import Trajectory
@@ -112,7 +112,7 @@ class Start:
     def begin_blind(self, state: NavState) -> VoMeasurement:
         """Take the filter's state at the first keyframe of a run without a camera; return the motion up to it: none."""
         self.first_state = state
-        return identity_motion(state.t_ns, 0, True, 0)
+        return replace(identity_motion(state.t_ns, 0, True, 0), tracking=Tracking.BLIND)
 
     def give_up(self) -> None:
         """Go on without gravity, by vision that is metric."""
@@ -134,12 +134,12 @@ class GravityWait:
         chain: KeyframeChain,
         inertial: Inertial,
         knows_scale: bool,
-        moves: Callable[[], bool | None],
+        said: Callable[[int], Said],
     ) -> None:
         """Bring `start` forward from the samples of `inertial`, and start its filter.
 
         `chain` is that of the keyframes. `knows_scale` is whether vision measures metres: where it does not, what is
-        seen before scale is known is kept. `moves` is what sensors of motion say, see `ReadingIntake.moves`.
+        seen before scale is known is kept. `said` is what further sensors say, see `ReadingIntake.said`.
         """
         self.counters: dict[str, int] = {}
         self._start, self._chain = start, chain
@@ -152,7 +152,7 @@ class GravityWait:
         gravity_m_s2 = config.machine.gravity_m_s2
         self._initialiser: Initialiser | BlindStart
         if rig.is_blind:
-            self._initialiser = BlindStart(config.init, noise, gravity_m_s2, moves)
+            self._initialiser = BlindStart(config.init, noise, gravity_m_s2, said)
         else:
             self._initialiser = Initialiser(
                 config.init, noise, gravity_m_s2, rig.T_body_cams[0], rig.cameras[0],

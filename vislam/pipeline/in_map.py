@@ -13,9 +13,8 @@ from vislam.trajectory.continuity import Continuity
 class Place:
     """Whether the place in the map is known, and how often it was lost and found again."""
 
-    def __init__(self, is_blind: bool = False) -> None:
-        """Begin at the origin of a map of one submap; `is_blind` is without a camera, which could lose it."""
-        self._is_blind = is_blind
+    def __init__(self) -> None:
+        """Begin at the origin of a map of one submap."""
         self.counters = {"frames_lost": 0, "relocalised": 0}
         self.submaps = Submaps()
 
@@ -32,7 +31,7 @@ class Place:
         if self.submaps.is_joined and not was_joined:
             self.counters["relocalised"] += 1
             return Localisation.RELOCALISED
-        is_lost = (tracking is Tracking.LOST and not self._is_blind) or not self.submaps.is_joined
+        is_lost = tracking is Tracking.LOST or not self.submaps.is_joined
         self.counters["frames_lost"] += is_lost
         return Localisation.LOST if is_lost else Localisation.TRACKING
 
@@ -40,9 +39,9 @@ class Place:
 class InMap:
     """Carries poses from odom into map without jumps, but for those with which the place in the map is found."""
 
-    def __init__(self, config: PublishConfig, is_blind: bool = False) -> None:
-        """Begin at the origin of a map of one submap; `is_blind` is without a camera."""
-        self.place = Place(is_blind)
+    def __init__(self, config: PublishConfig) -> None:
+        """Begin at the origin of a map of one submap."""
+        self.place = Place()
         self._published = Continuity(config)
         self._T_map_odom = np.eye(4)  # at the last frame
 

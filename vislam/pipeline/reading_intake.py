@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config
-from vislam.core.chi_square import chi_square_limit
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState, Tracking
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, MagSample, NavState
 from vislam.core.readings import MotionReadings, OwnNow, OwnStart, PlacedReading, Reading, Station
 from vislam.ekf.filtering import Filtering
 from vislam.imu import ImuBuffer, ImuNoise, preintegrate
+from vislam.pipeline.blind_start import Said, said_of
 from vislam.pipeline.inertial_stages import Inertial
 from vislam.pipeline.slip_watch import SlipWatch
 from vislam.sensors import USER_ERRORS, BodyState, Sensor, Suite, wrong_jacobians
@@ -134,10 +134,9 @@ class ReadingIntake:
         for name in self._of_magnetometer:
             self.add(Reading(name, sample.t_ns, sample.field_ut))
 
-    def moves(self) -> bool | None:
-        """Return whether the body moves, as sensors of motion said last before the filter began; None: none did."""
-        said = {one.sensor: one for one in self._waiting if self._suite[one.sensor].sees_motion_only}
-        return any(_shows_motion(one, self._suite) for one in said.values()) if said else None
+    def said(self, from_ns: int) -> Said:
+        """Return what sensors of motion said last before the filter began, and fixes since `from_ns`."""
+        return said_of(self._waiting, self._suite, from_ns)
 
     def give_up_filter(self) -> None:
         """Go on with the path of vision alone: gravity could not be found."""
@@ -333,18 +332,6 @@ def _path_between(
     return _InertialPath(buffer, whole, state, gravity_m_s2, float(np.sqrt(force_variance))).station
 
 
-def _shows_motion(reading: Reading, suite: Suite) -> bool:
-    """Return whether a reading of a sensor of motion is not that of a body at rest."""
-    sensor, none = suite[reading.sensor], np.zeros(3)
-    own = suite.starts[suite.own(reading.sensor)]
-    try:
-        off = sensor.residual(reading.values, BodyState(reading.t_ns, np.eye(3), *[none] * 5), own)
-        noise = sensor.noise(reading.values) if reading.covariance is None else reading.covariance
-        return bool(off @ np.linalg.solve(noise, off) > chi_square_limit(sensor.gate_probability, len(off)))
-    except USER_ERRORS:  # it is left out once the filter runs
-        return False
-
-
 def _first_values(name: str, sensor: Sensor, beginning: _Beginning) -> OwnStart | None:
     """Return what a sensor begins with; None: too early. Raises ValueError where that cannot be used."""
     begun = sensor.begin(beginning.readings, beginning.bodies)
@@ -373,7 +360,7 @@ def _with_motions(
     """
     if any(suite[name].sees_motion_only for name in begun):
         packet = replace(packet, filter_state=state)
-    if packet.begins_submap or packet.vo.tracking is not Tracking.LOST:
+    if packet.begins_submap or packet.vo.tracking.sees:
         return packet
     by_sensor: dict[str, list[PlacedReading]] = {}
     rest: list[PlacedReading] = []

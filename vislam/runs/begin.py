@@ -177,6 +177,10 @@ def check_fits(stored: Session, recording: Recording, config: Config, noise: Imu
     """Raise UsageError when a recording, with these settings, cannot go on in the map of a session."""
     info = stored.info()
     settings, sensors = info.get("config") or {}, json.loads(json.dumps(rig_data(recording.rig)))
+    if recording.rig.is_blind:
+        raise UsageError("a run without a camera recognises no place, so it cannot begin in a map: leave --map away")
+    if settings.get("frontend", {}).get("mode") == "none":
+        raise UsageError(f"{stored.path} was made without a camera and has no places to recognise: leave --map away")
     if settings.get("graph", {}).get("coupling") != "tight" or config.graph.coupling != "tight":
         raise UsageError("a map is made and continued with tight coupling only; use --graph.coupling tight for both")
     if info.get("rig") != sensors:

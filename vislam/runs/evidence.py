@@ -18,12 +18,13 @@ from vislam.core.streams import Happening, StreamEvent
 from vislam.imu import Preintegrated, preintegrate
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
-from vislam.runs.verdict import LOST_S, Apart, Evidence, Moved, TurnStep, force_agreement, turn_agreement
+from vislam.runs.verdict import LOST_S, Apart, Driven, Evidence, Moved, TurnStep, force_agreement, turn_agreement
 from vislam.trajectory import Trajectory, align, associate
 
 _MIN_COMPARED = 10  # poses
 _AT_ONCE_NS = 200_000_000
 _OF_FRAMES = ("cam", "depth")  # begin the names of their streams: frames between are bridged by what was seen before
+_EXPLAINED = 0.5  # of the turns of what drives, by the gyroscope's: else they show nothing
 _SAMPLES = 4  # of a span, at least, for a judgement
 _REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
 _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
@@ -38,6 +39,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
     offered = [(ekf.get(first, 0), sum(ekf.get(name, 0) for name in others)) for first, *others in _VISION]
     evidence = Evidence(
         mode=report.mode,
+        is_alone=report.mode == "none" and not report.sensors,
         frames=feed.get("frames", 0),
         frames_lost=front.get("frames_lost", 0),
         longest_loss_s=1e-3 * front.get("longest_loss_ms", 0),
@@ -76,6 +78,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         events=tuple(_together([e for e in report.events if _matters(e, machine.max_gap_s)], report.first_t_ns)),
         moving=tuple(_together([e for e in report.events if e.happening is Happening.MOVING], report.first_t_ns)),
         causes=tuple(_together([e for e in report.events if _may_explain(e)], report.first_t_ns)),
+        driven=tuple(_driven(name, entry) for name, entry in report.sensors.items() if "stated" in entry),
         **_calibration(report.calibration),
     )
     condition, noise, given = report.condition, report.noise_ratios, report.told_noise
@@ -128,6 +131,21 @@ def _together(events: Sequence[StreamEvent], begin_ns: int) -> Iterator[str]:
         groups.setdefault(next(near, (event.happening, event.from_ns)), []).append(event)
     for some in groups.values():
         yield replace(some[0], stream=", ".join(event.stream for event in some)).words(begin_ns)
+
+
+def _driven(name: str, entry: dict[str, Any]) -> Driven:
+    """Return what was found of a sensor of what drives; its turns where these explain most of what it measured."""
+    turns, found = entry.get("turns", {}), entry.get("filter", {"values": (), "sigmas": ()})
+    own = {
+        variable: (start, prior, Moved.measured(value - start, sigma, prior))
+        for (variable, (start, prior)), value, sigma in zip(
+            entry["stated"].items(), found["values"], found["sigmas"], strict=False
+        )
+    }
+    if turns.get("explained", 0.0) < _EXPLAINED:
+        return Driven(name, own)
+    turn = Moved(turns["factor"] - 1.0, turns["factor_sigma"])
+    return Driven(name, own, turn, turns["slip"], Moved(turns["delay_s"], turns["delay_sigma_s"]))
 
 
 def _calibration(learned: dict[str, float]) -> dict[str, Any]:

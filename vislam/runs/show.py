@@ -29,7 +29,7 @@ def show_step(viewer: Viewer, step: Step, mapper: Mapper | None, is_level: bool)
     viewer.log_scalars(frame.t_ns, _plotted(step))
     if step.localisation is Localisation.RELOCALISED:
         viewer.log_note(frame.t_ns, f"relocalised: submap {step.submap} of the trajectory is joined with the map")
-    if track.vo.tracking != Tracking.OK:
+    if track.vo.tracking in (Tracking.DEGRADED, Tracking.LOST):
         viewer.log_note(frame.t_ns, f"{track.vo.tracking}: {track.reason}")
     for keyframe in step.keyframes:
         T_map_body = keyframe.update.T_map_odom @ keyframe.odometry.T_odom_body

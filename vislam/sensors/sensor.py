@@ -41,6 +41,7 @@ class Sensor(ABC):
             "accel_bias". Numerical derivatives are taken by these only.
         sees_motion_only: neither place nor heading nor a frame of its own shows in it, as with wheels: the same motion
             elsewhere gives the same reading. Then the sliding window takes it, too, where the camera is blind.
+        gives_fixes: its values are a point [3] in metres, in axes that stay: so they show motion from the first on.
         variables: own ones, estimated with the body's state by every estimator; each has its own values.
         gate_probability: that a good reading passes the test of its innovation.
         regain_m: how far readings that the gate refused, but that agree, may move a filter at most; 0: never.
@@ -51,6 +52,7 @@ class Sensor(ABC):
     columns: ClassVar[tuple[str, ...]] = ()
     touches: ClassVar[tuple[str, ...]] = ("rotation", "position", "velocity")
     sees_motion_only: ClassVar[bool] = False
+    gives_fixes: ClassVar[bool] = False
     slips: ClassVar[tuple[str, ...]] = ()
     variables: tuple[Variable, ...] = ()
     gate_probability: float = 0.999

@@ -96,7 +96,7 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
         Raises:
             ValueError: the state is not finite, or its covariance not positive semidefinite.
         """
-        usable = vo is not None and vo.has_scale and vo.tracking is not Tracking.LOST and not why_unusable(vo)
+        usable = vo is not None and vo.has_scale and vo.tracking.sees and not why_unusable(vo)
         self._begin(state.t_ns, self._loose.begin(state, vo if usable else None, self._state.ledger.noise))
 
     def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
@@ -118,7 +118,9 @@ class Ekf(SensedTimeline[LooseState, LooseMeasurement]):
         Metric motion corrects six degrees; without scale, rotation and direction; without parallax, rotation. A motion
         that is lost, that refers to another keyframe or that fails the gate is counted and changes nothing.
         """
-        if vo.tracking is Tracking.LOST:
+        if vo.tracking is Tracking.BLIND:
+            return UpdateResult(False, float("nan"), "there is no camera")
+        if not vo.tracking.sees:
             return self._refuse("vo_lost", "tracking lost")
         reason = why_unusable(vo)
         if reason:

@@ -16,7 +16,7 @@ import numpy as np
 
 from vislam.config import EkfConfig, MachineConfig
 from vislam.core.geometry import so3_log
-from vislam.core.messages import Array, NavState, Observations, Tracking, VoMeasurement
+from vislam.core.messages import Array, NavState, Observations, VoMeasurement
 from vislam.ekf.history import AtRest, Event
 from vislam.ekf.sensed_timeline import SensedTimeline
 from vislam.ekf.tight.core import CameraCalibration, TightCore, TightState
@@ -102,7 +102,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         when they end or have been followed through the whole window. No new point is kept in the state while the motion
         does not show scale.
         """
-        if vo.tracking is Tracking.LOST:
+        if not vo.tracking.sees:
             return self._refuse("vision_lost", "tracking lost")
         if self._history is not None and self._history.holds(vo.t_ns, FrameTracks):
             return self._refuse("vision_duplicate", f"a frame of {vo.t_ns} ns is here already")

@@ -19,7 +19,7 @@ from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
 from vislam.core.errors import DataError, HardwareError
-from vislam.core.messages import Array, Frame, ImuSample, Keyframe, Tracking, no_observations
+from vislam.core.messages import Array, Frame, ImuSample, Keyframe, no_observations
 from vislam.ekf.correction import Hint
 from vislam.frontend.start import Initialisation
 from vislam.hw.health import Health
@@ -212,7 +212,7 @@ class FrontProcess:
             self._send(Start(found.last, step.track.vo))
         if self.front.config.ekf.coupling == "tight":
             if step.state is not None:
-                is_tracking = step.track.vo.tracking is not Tracking.LOST
+                is_tracking = step.track.vo.tracking.sees
                 at_rest = any(correction.at_rest for correction in step.corrections)
                 self._send(Rebase(step.state, is_tracking, at_rest, self.front.noise_scale))
             return

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vislam.core.files import plain
-from vislam.core.messages import Array
+from vislam.core.messages import Array, Tracking
 from vislam.hw.health import Health
 from vislam.live.web.updates import FrameUpdate, KeyframeCloud, LoopUpdate, MapUpdate, Saved, Status, StepPicture
 from vislam.live.wire.published_pose import PublishedPose
@@ -25,7 +25,7 @@ _ANSWER_POINTS = 40_000  # of one answer: 0.4 MB; the page asks again at once
 _PATH_STEP_M = 0.02
 _MOST_FRAMES = 600  # that the plot of vision remembers: two minutes
 _NS = 1e-9
-_STATES = ("ok", "degraded", "lost")
+_STATES = tuple(Tracking)
 
 
 class Feed:

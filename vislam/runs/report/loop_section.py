@@ -20,7 +20,7 @@ def loops_section(run: RunFiles, scene: Scene) -> str:
     """Return the section about loops; empty where the run reports nothing of them."""
     counts = as_dict(run.metrics, "loops")
     if not run.loops:
-        return section("Loops", note("No candidates.")) if counts else ""
+        return section("Loops", note("No candidates.")) if counts and run.has_camera else ""
     by_decision = Counter(loop.decision for loop in run.loops)
     summary = ", ".join(f"{by_decision[d]} {d}" for d in _DECISIONS if by_decision[d])
     order = sorted(run.loops, key=lambda loop: (_rank(loop.decision), loop.to_id, loop.from_id))

@@ -103,7 +103,8 @@ def _about(run: RunFiles) -> str:
             f"{number(m.get('duration_s'), 1)} s of recording processed in {number(m.get('wall_s'), 1)} s."
         )
     if m.get("mode"):
-        parts.append(f"Mode: {m['mode']}{', inertial' if m.get('has_imu') else ''}.")
+        mode = m["mode"] if run.has_camera else "no camera"
+        parts.append(f"Mode: {mode}{', inertial' if m.get('has_imu') else ''}.")
     start = as_dict(m, "initialisation")
     if start and m.get("has_imu") is not False:
         when = number(start.get("t_s"), 2, " s")
@@ -162,9 +163,9 @@ def _tiles(run: RunFiles, scene: Scene) -> str:
         tiles.append(tile(number(cost.get("cpu_ms_per_frame"), 0), "ms", "of CPU per frame"))
         tiles.append(tile(number(cost.get("peak_memory_mb"), 0), "MB", "of memory at most"))
         tiles.append(tile(number(cost.get("first_pose_s"), 2), "s", "of recording until the first pose"))
-    tiles.append(
-        tile(number(loops.get("accepted", 0), 0), "", f"loops of {number(loops.get('candidates', 0), 0)} candidates")
-    )
+    if run.has_camera:
+        of = f"loops of {number(loops.get('candidates', 0), 0)} candidates"
+        tiles.append(tile(number(loops.get("accepted", 0), 0), "", of))
     lost, spells = _lost_frames(run)
     label = "frames lost" if spells == 0 else f"frames lost, in {spells} outage{'s' if spells > 1 else ''}"
     if run.tracking is not None:
@@ -266,7 +267,8 @@ def _over_time(run: RunFiles, scene: Scene) -> str:
     if not figure:
         return ""
     text = "Green strokes are accepted loops. State: green ok, yellow degraded, red lost."
-    return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), note(text), kind="still")
+    words = note(text) if run.has_camera else ""
+    return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), words, kind="still")
 
 
 def _map(run: RunFiles) -> str:

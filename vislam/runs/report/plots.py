@@ -17,7 +17,7 @@ from vislam.runs.report.scene import Scene, loop_segments
 from vislam.runs.report.style import CODE, RC, svg
 
 _WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
-_STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad"}
+_STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad", "blind": "muted"}
 _MAX_STRETCH = 25.0  # of the vertical axis: more would turn millimetres into mountains
 _MAX_REJECTED = 200  # loops drawn: more is a red cloud
 _MAX_LOOP_LINES = 25

@@ -52,6 +52,11 @@ class RunFiles:
     loop_pictures: list[Path]
     unread: dict[str, str] = field(default_factory=dict)  # file name: why it could not be used
 
+    @property
+    def has_camera(self) -> bool:
+        """Whether the run had one."""
+        return self.metrics.get("mode") != "none"
+
 
 def read_run(folder: Path) -> RunFiles:
     """Read a run folder. Raises DataError when it is no folder or holds nothing of a run."""
@@ -103,7 +108,8 @@ def _read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def _read_tracking(path: Path) -> TrackingRows:
+def _read_tracking(path: Path) -> TrackingRows | None:
+    """Return what vision made of the frames; None where there was no camera."""
     rows = read_rows(path, TRACKING_COLUMNS)
     try:
         t_ns = np.array([int(row["t_ns"]) for _, row in rows], dtype=np.int64)
@@ -111,6 +117,8 @@ def _read_tracking(path: Path) -> TrackingRows:
         tracking = [Tracking(row["tracking"]).value for _, row in rows]
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: {error}") from error
+    if tracking and all(word == Tracking.BLIND for word in tracking):
+        return None
     return TrackingRows(t_ns, tracking, inliers, [row["reason"] for _, row in rows])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
-from vislam.core.messages import Array
+from vislam.core.messages import Array, Tracking
 from vislam.loop import caption
 from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.semantic.layer_files import CLASSES_NAME, read_layer
@@ -28,7 +28,7 @@ _MAX_PATH = 4000  # poses of a line
 _MAX_LOOPS = 2000
 _MAX_TEXT = 400  # letters of one reason
 _FAR_QUANTILE = 0.002  # points beyond it on either side do not decide how large the picture is
-_STATES = ("ok", "degraded", "lost")
+_STATES = tuple(Tracking)
 MAX_VOXELS = 120_000  # 1 MB of page
 _MAX_CLASSES = 16  # with a colour and a switch of their own
 _REST = {"name": "all other labels", "color": [128, 128, 128]}
@@ -60,6 +60,7 @@ def view_data(run: RunFiles, scene: Scene) -> dict[str, Any]:
             }
             for name, curve in scene.errors.items()
         },
+        "has_camera": run.has_camera,
         "tracking": _tracking(run, scene),
         "loops": _loops(run, scene),
         "cloud": _cloud(run, scene),

@@ -27,6 +27,7 @@ def view_elements(data: dict[str, Any]) -> str:
         return ""
     cloud = data["cloud"]
     shown = f"{cloud['count']:,} of {cloud['of']:,} points".replace(",", "\u202f") if cloud else "no points"
+    bands = "Green ticks are accepted loops; bands say that vision was degraded (yellow) or lost (red). "
     return (
         '<div class="view" id="view"><div class="stage">'
         '<div class="canvas"><div class="surface">'
@@ -39,9 +40,9 @@ def view_elements(data: dict[str, Any]) -> str:
         '<output id="view-now"></output></div></div>'
         '<aside class="details" id="view-details"></aside>'
         '<div class="plots" id="view-plots"></div>'
-        '<p class="note hint">Point at a curve: the camera stands there. Drag to zoom, '
-        '<button type="button" id="plots-whole">show all</button>. Green ticks are accepted loops; bands say that '
-        "vision was degraded (yellow) or lost (red). Click a loop or a path in the map, "
+        '<p class="note hint">Point at a curve: the body stands there. Drag to zoom, '
+        '<button type="button" id="plots-whole">show all</button>. '
+        f"{bands if data['has_camera'] else ''}Click a loop or a path in the map, "
         f"of which you see {escape(shown)}.</p></div>"
     )
 

@@ -1,12 +1,13 @@
 """What a run is worth, judged without any truth: evidence in, a verdict with its reasons out."""
 
 from vislam.runs.verdict.agreement import ForceAgreement, TurnAgreement, TurnStep, force_agreement, turn_agreement
-from vislam.runs.verdict.evidence import Apart, Evidence, Innovations, Moved
+from vislam.runs.verdict.evidence import Apart, Driven, Evidence, Innovations, Moved
 from vislam.runs.verdict.judging import LOST_S, Trust, Verdict, judge, verdict_sentence
 
 __all__ = [
     "LOST_S",
     "Apart",
+    "Driven",
     "Evidence",
     "ForceAgreement",
     "Innovations",

@@ -31,6 +31,17 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True)
+class Driven:
+    """What a run found out about a sensor of what drives, against what was stated of it."""
+
+    name: str
+    own: dict[str, tuple[float, float, Moved | None]]  # by variable: what was stated, its sigma, what was measured
+    turn: Moved | None = None  # of its turns over the gyroscope's, from 1
+    slip: float = 0.0  # in turns, as stated
+    delay: Moved | None = None  # s, of its stamps behind the IMU's
+
+
+@dataclass(frozen=True, slots=True)
 class Apart:
     """How far filter and graph are from each other, each moved onto the other by yaw and position."""
 
@@ -48,6 +59,7 @@ class Evidence:
     moving: tuple[str, ...] = ()  # events: something moved by itself before the camera
     # vision
     mode: str = ""
+    is_alone: bool = False  # the IMU: there is neither a camera nor a further sensor
     frames: int = 0
     frames_lost: int = 0
     longest_loss_s: float = 0.0
@@ -98,6 +110,7 @@ class Evidence:
     rotation: Moved | None = None  # deg, of the camera on the body
     turns: TurnAgreement | None = None
     forces: ForceAgreement | None = None
+    driven: tuple[Driven, ...] = ()
     # inertial data
     gyro_noise: float | None = None  # rad/s/sqrt(Hz), white noise in the quietest half second
     accel_noise: float | None = None  # m/s^2/sqrt(Hz)

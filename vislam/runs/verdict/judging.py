@@ -14,6 +14,8 @@ from vislam.runs.verdict.evidence import Evidence, Moved
 
 # of the camera's clock as given: drivers that stamp on arrival are off by up to 30 ms
 _CLOCK_SIGMA_S = 0.015
+_STAMP_SIGMA_S = 0.03  # of readings of what drives: stamped on arrival, and averages over their period
+_DRIVEN_SIGMA = 0.04  # relative, of turns by wheels: tracks and radii are known to 3 % each; or the slip stated
 _TURN_SCALE_SIGMA = 0.004  # relative, of focal length (Kalibr: 0.2 %) and of a calibrated gyro (0.3 %)
 _FORCE_SCALE_SIGMA = 0.01  # relative, of accelerometer and of baseline or depth, all calibrated
 # white noise of inertial data, in the quietest half second; what is stated does not matter, for estimators learn it.
@@ -196,7 +198,8 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
                 "explains: calibrate, or state more noise"
             )
     if e.sigma_m > _SIGMA_M:
-        yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst"
+        alone = ", for an IMU alone does not see the way: add wheels, fixes or a camera" if e.is_alone else ""
+        yield f"the filter's position was uncertain by {e.sigma_m:.1f} m (1 sigma) at its worst{alone}"
     if e.uniform_s > _UNIFORM_S:
         yield (
             f"uniform motion for {e.uniform_s:.0f} s, in which one camera's scale is held by the IMU's biases alone: "
@@ -273,8 +276,29 @@ def _inertial(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         )
 
 
+def _driven(e: Evidence, c: VerdictConfig) -> Iterator[str]:
+    for one in e.driven:
+        if one.delay is not None and _beyond(one.delay, _STAMP_SIGMA_S, 1, c):
+            side = "late" if one.delay.by > 0.0 else "early"
+            yield (
+                f"the stamps of {one.name} are {abs(one.delay.by):.2f} ± {one.delay.sigma:.2f} s {side} against the "
+                "IMU's: stamp readings when they are measured"
+            )
+        if one.turn is not None and one.turn.by < -1.0 - 4.0 * one.turn.sigma:
+            yield f"{one.name} turn the other way than the gyroscope: swap left and right, or check the IMU's axes"
+        elif one.turn is not None and _beyond(one.turn, max(_DRIVEN_SIGMA, one.slip), 1, c):
+            yield f"{one.name} turn by {_percent(one.turn.by)} angles than the gyroscope: measure track and radii"
+        for variable, (stated, sigma, moved) in one.own.items():
+            if moved is not None and _beyond(moved, sigma, 1, c):
+                yield f"{_own_words(one.name, variable, stated, moved)}: measure it, or state a larger sigma"
+
+
+def _own_words(name: str, variable: str, stated: float, moved: Moved) -> str:
+    return f"{variable} of {name} is {stated + moved.by:.3f} ± {moved.sigma:.3f}, stated was {stated:.3f}"
+
+
 _TESTS: tuple[Callable[[Evidence, VerdictConfig], Iterator[str]], ...] = (
-    _streams, _start, _vision, _calibration, _inertial, _filter, _graph,
+    _streams, _start, _vision, _calibration, _driven, _inertial, _filter, _graph,
 )  # fmt: skip
 
 
@@ -290,6 +314,10 @@ def _moved(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     turn = e.rotation
     if turn is not None and _beyond(turn, 0.0, 3, c) and not _beyond(turn, c.rotation_sigma_deg, 3, c):
         yield f"the camera is turned by {turn.by:.2f} ± {turn.sigma:.2f} degrees against its file; corrected"
+    for one in e.driven:
+        for variable, (stated, sigma, moved) in one.own.items():
+            if moved is not None and _beyond(moved, 0.0, 1, c) and not _beyond(moved, sigma, 1, c):
+                yield f"{_own_words(one.name, variable, stated, moved)}; corrected"
 
 
 def _beyond(moved: Moved, told_sigma: float, degrees: int, config: VerdictConfig) -> bool:

@@ -112,7 +112,7 @@ class RunViewer:
     def log_frame(self, frame: Frame, observations: Observations, tracking: Tracking) -> None:
         """Log the tracking state, and for one frame in `every_frames` the picture with its tracks coloured by age."""
         self._set_time(frame.t_ns)
-        if tracking is not self._tracking:
+        if tracking is not self._tracking and tracking in _TRACKING_COLORS:
             self._stream.log("status/tracking", rr.StateChange(state=tracking.value))
             self._tracking = tracking
         ids = observations.track_ids.tolist()

@@ -43,6 +43,7 @@ class Position(Configured):
     columns = ("east_m", "north_m", "up_m")
     sigma_columns = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
     touches = ("rotation", "position")
+    gives_fixes = True
 
     def __init__(self, settings: PositionSettings | None = None) -> None:
         """Take settings; the defaults without any."""

@@ -1,7 +1,7 @@
 // What the page carries, unpacked: little-endian typed arrays in base64.
 
 export const DECISIONS = ["accepted", "pending", "rejected"];
-export const STATES = ["ok", "degraded", "lost"];
+export const STATES = ["ok", "degraded", "lost", "blind"];
 
 function bytesOf(text) {
   const raw = atob(text);

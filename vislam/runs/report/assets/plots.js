@@ -4,7 +4,7 @@ import { STATES, color } from "./data.js";
 /* global uPlot */
 
 const HEIGHT = { position: 170, rotation: 130, inliers: 110 };
-const STATE_COLORS = ["good", "warn", "bad"];
+const STATE_COLORS = ["good", "warn", "bad", "muted"];
 
 function joined(curves) {
   const tables = curves.map((curve) => [Array.from(curve.t), Array.from(curve.values, (v) => (isNaN(v) ? null : v))]);

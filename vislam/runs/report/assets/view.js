@@ -165,6 +165,28 @@ export class View {
 
   addMarker() {
     const size = 0.07 * this.reach;
+    const segments = this.data.has_camera === false ? this.arrow(size) : this.pyramid(size);
+    const shape = this.line(new Float32Array(segments), "accent", 1, THREE.LineSegments);
+    const ball = new THREE.Mesh(new THREE.SphereGeometry(0.011 * this.reach, 16, 12), new THREE.MeshBasicMaterial());
+    this.painted.push([ball.material, "accent"]);
+    for (const node of [shape, ball]) {
+      node.material.depthTest = false;
+      node.renderOrder = 4;
+    }
+    this.marker = new THREE.Group();
+    this.marker.matrixAutoUpdate = false;
+    this.marker.add(shape, ball);
+    this.scene.add(this.marker);
+  }
+
+  // Along x of a body without a camera.
+  arrow(size) {
+    const [tip, back, side] = [[size, 0, 0], 0.7 * size, 0.2 * size];
+    return [0, 0, 0, ...tip, ...tip, back, side, 0, ...tip, back, -side, 0];
+  }
+
+  // What the camera sees.
+  pyramid(size) {
     const depth = size;
     const [w, h] = [0.62 * size, 0.46 * size];
     const T = this.data.camera || [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]];
@@ -174,17 +196,7 @@ export class View {
     const segments = [];
     corners.forEach((corner, k) => segments.push(...eye, ...corner, ...corner, ...corners[(k + 1) % 4]));
     segments.push(...corners[0], ...place(0, -1.5 * h, depth), ...place(0, -1.5 * h, depth), ...corners[1]);
-    const frustum = this.line(new Float32Array(segments), "accent", 1, THREE.LineSegments);
-    const ball = new THREE.Mesh(new THREE.SphereGeometry(0.011 * this.reach, 16, 12), new THREE.MeshBasicMaterial());
-    this.painted.push([ball.material, "accent"]);
-    for (const node of [frustum, ball]) {
-      node.material.depthTest = false;
-      node.renderOrder = 4;
-    }
-    this.marker = new THREE.Group();
-    this.marker.matrixAutoUpdate = false;
-    this.marker.add(frustum, ball);
-    this.scene.add(this.marker);
+    return segments;
   }
 
   addControls() {
