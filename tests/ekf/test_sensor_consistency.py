@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart
-from vislam.sensors import Sensor, Suite
+from vislam.sensors import Correlated, Sensor, Suite
 from worlds import monte_carlo as mc
 from worlds.sensed_paths import KINDS, Beacon, Fix, Height, SensedRun, Speed, made
 
@@ -58,6 +58,7 @@ def campaign(
         {"fix": Fix(), "speed": Speed()},
         {"fix": Fix(), "height": Height()},
         {"fix": Fix(), "beacon": Beacon()},
+        {"fix": Correlated(Fix(), [0.3], 5.0)},
     ],
     ids="+".join,
 )

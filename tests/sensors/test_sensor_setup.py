@@ -80,7 +80,7 @@ WRONG = {
     "[sensors.a]\nfile='x.csv'": 'option kind: a name is asked, as kind = "position", got None',
     "[sensors.a]\nkind='hight'": "option kind: no kind of sensor is called 'hight'; there are: ackermann,",
     "[sensors.'a b']\nkind='height'": "[sensors.a b]: a name of letters",
-    "[sensors.a]\nkind='height'\nsigma=1.0": "[sensors.a]: no option 'sigma'; there are: baud, delay_s, file,",
+    "[sensors.a]\nkind='height'\nsigma=1.0": "[sensors.a]: no option 'sigma'; there are: baud, correlated_sigma,",
     "[sensors.a]\nkind='height'\nsigma_m='x'": "[sensors.a]: option sigma_m: Input should be a valid number",
     "[sensors.a]\nkind='height'\nsigma_m=0.0": "[sensors.a]: sigma_m is 0; allowed is more than 0",
     "[sensors.a]\nkind='height'\nsigma_m=nan": "[sensors.a]: sigma_m is nan",

@@ -107,14 +107,13 @@ class SensedRun:
         start, starts, readings, own = mc.start(way, mc.START_SIGMAS, rng), [], [], {}
         for name, sensor in sensors.items():
             sigmas = np.array([variable.sigma for variable in sensor.variables])
-            walks = np.array([variable.walk for variable in sensor.variables])
             values = np.array([variable.start for variable in sensor.variables])
             if len(values):
                 starts.append(OwnStart(name, values, sigmas))
             true = values + sigmas * rng.normal(size=len(values))
             step = every.get(name, len(way.t_ns))  # more than there are: none
             for k in range(step, len(way.t_ns), step):
-                true = true + walks * np.sqrt(step / mc.IMU.rate_hz) * rng.normal(size=len(true))
+                true = later(sensor, true, step / mc.IMU.rate_hz, rng)
                 exact = said(sensor, body_of_truth(way, k), true)
                 root = np.linalg.cholesky(sensor.noise(exact))
                 noisy = exact + root @ rng.normal(size=len(exact))
@@ -144,6 +143,14 @@ def body_of_truth(way: mc.Drive, k: int) -> BodyState:
     bias = way.biases[k]
     T, rate = way.pose(k), way.samples[k, :3] - bias[:3]
     return BodyState(int(way.t_ns[k]), T[:3, :3], T[:3, 3], way.truth[k, 3:6], bias[:3], bias[3:], rate)
+
+
+def later(sensor: Sensor, own: Array, dt_s: float, rng: np.random.Generator) -> Array:
+    """Return own variables [V] after a time."""
+    steps = [variable.after(dt_s) for variable in sensor.variables]
+    decays, variances = np.array(steps, dtype=np.float64).reshape(-1, 2).T
+    starts = np.array([variable.start for variable in sensor.variables])
+    return starts + decays * (own - starts) + np.sqrt(variances) * rng.normal(size=len(own))
 
 
 def said(sensor: Sensor, body: BodyState, own: Array) -> Array:

@@ -91,24 +91,30 @@ class Sensing:
         P[:, rows] = 0.0
         P[rows, rows] = np.asarray(start.sigmas, dtype=np.float64) ** 2
 
-    def grow(self, name: str, t_ns: int, since_ns: Mapping[str, int], P: Array) -> None:
-        """Add to P [n, n], which own variables end, what a sensor's have walked since it last corrected, in place.
+    def grow(self, name: str, t_ns: int, since_ns: Mapping[str, int], values: Array, P: Array) -> None:
+        """Take a sensor's own variables from when it last corrected to a time, in place.
 
-        Nothing else reads the variance of own variables, and what others correct only takes from it: late is exact.
+        They are among `values` [K] and end P [n, n]. Until then they stand for what they were when it corrected, which
+        others may correct, too: late is exact.
         """
+        if name not in since_ns or not any(variable.changes for variable in self.suite[name].variables):
+            return
         at = self.suite.own(name)
-        if self.suite.walks[at].any():
-            rows = np.arange(at.start, at.stop) + len(P) - self.suite.size
-            P[rows, rows] += self.suite.walks[at] ** 2 * ((t_ns - since_ns[name]) * 1e-9)
+        decays, variances = self.suite.after(name, (t_ns - since_ns[name]) * 1e-9)
+        rows = np.arange(at.start, at.stop) + len(P) - self.suite.size
+        values[at] = self.suite.starts[at] + decays * (values[at] - self.suite.starts[at])
+        P[rows] *= decays[:, None]
+        P[:, rows] *= decays
+        P[rows, rows] += variances
 
     def own(self, name: str, own: OwnVariables, t_ns: int) -> tuple[Array, Array]:
         """Return a sensor's own values [V] and their covariance [V, V]; before it begins, what it assumes of them."""
         at = self.suite.own(name)
         if name not in own.since_ns:
             return self.suite.starts[at].copy(), np.diag(self.suite.sigmas[at] ** 2)
-        covariance = own.covariance.copy()
-        self.grow(name, t_ns, own.since_ns, covariance)
-        return own.values[at].copy(), covariance[at, at]
+        values, covariance = own.values.copy(), own.covariance.copy()
+        self.grow(name, t_ns, own.since_ns, values, covariance)
+        return values[at], covariance[at, at]
 
     def rows(self, reading: Reading, body: BodyState, own: OwnVariables, out: Outcome) -> Rows | None:
         """Return a reading as whitened rows; None, counted, where its sensor has not begun or fails."""

@@ -2,7 +2,7 @@
 
 Each own variable is a key of one number, in units of how well it was known when the sensor began: gtsam's thresholds of
 relinearisation hold for all keys of one letter. One that does not change has one key; one that walks has a key at each
-keyframe with readings, tied to the one before, and begins anew with each submap.
+keyframe with readings, tied to the one before, and begins anew with each submap. One that forgets does likewise.
 """
 
 from __future__ import annotations
@@ -262,7 +262,7 @@ class Readings:
         begun.first = entry.number if begun.first < 0 else begun.first
         for n, variable in enumerate(self._suite[name].variables, first):
             at = begun.newest.get(n)
-            walks = variable.walk > 0.0
+            walks = variable.changes
             entry.keys.append(walking_key(n, record.id) if walks else own_key(n))
             entry.earlier.append(walking_key(n, at) if walks and at is not None else None)
             entry.new.append(walks or n not in begun.constant)
@@ -327,15 +327,29 @@ def _ties(entry: _Entry, begun: _Begun | None, variables: Sequence[Variable]) ->
     for n, (variable, unit) in enumerate(zip(variables, units, strict=True)):
         earlier = entry.earlier[n]
         if earlier is not None:
-            sigma = max(variable.walk * np.sqrt(max(entry.dt_s[n], 0.0)), _SIGMA_MIN) / unit
-            model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-            out.append(gtsam.BetweenFactorDouble(earlier, entry.keys[n], 0.0, model))
+            decay, variance = variable.after(entry.dt_s[n])
+            model = gtsam.noiseModel.Isotropic.Sigma(1, max(np.sqrt(variance), _SIGMA_MIN) / unit)
+            if decay == 1.0:
+                out.append(gtsam.BetweenFactorDouble(earlier, entry.keys[n], 0.0, model))
+            else:
+                out.append(_forgetting(earlier, entry.keys[n], decay, variable.start / unit, model))
         elif entry.new[n]:
             # what walks and begins anew with a submap has walked nobody knows how far since it was told
             sigma = 1.0 if entry.number == begun.first else max(variable.sigma / unit, 1.0)
             model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
             out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], model))
     return out
+
+
+def _forgetting(
+    earlier: int, later: int, decay: float, start: float, model: gtsam.noiseModel.Isotropic
+) -> gtsam.NonlinearFactor:
+    """Return the factor `later - start = decay * (earlier - start) + noise`; it is linear."""
+    around, one = gtsam.Values(), np.ones((1, 1))
+    around.insert(earlier, 0.0)
+    around.insert(later, 0.0)
+    linear = gtsam.JacobianFactor(earlier, -decay * one, later, one, np.array([(1.0 - decay) * start]), model)
+    return gtsam.LinearContainerFactor(linear, around)
 
 
 def _label(entry: _Entry) -> Label:

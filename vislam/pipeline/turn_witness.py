@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.messages import ImuSample, MagSample
 from vislam.core.readings import Reading
-from vislam.sensors import USER_ERRORS, BodyState, Suite
+from vislam.sensors import USER_ERRORS, BodyState, Correlated, Suite
 from vislam.sensors.kinds.driven import Driven
 
 _DELAYS_S = np.arange(-10, 11) * 0.05  # of the reading's stamp, that are tried
@@ -109,4 +109,5 @@ class TurnWitness:
 def turn_witnesses(suite: Suite | None) -> list[TurnWitness]:
     """Return a witness for each sensor of what drives."""
     sensors = {} if suite is None else {name: suite[name] for name in suite.names}
-    return [TurnWitness(name, sensor) for name, sensor in sensors.items() if isinstance(sensor, Driven)]
+    alone = {name: one.sensor if isinstance(one, Correlated) else one for name, one in sensors.items()}
+    return [TurnWitness(name, sensor) for name, sensor in alone.items() if isinstance(sensor, Driven)]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from vislam.core.late import late
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured
+from vislam.sensors.correlated import Correlated
 from vislam.sensors.linear import Linear, SensorError, derived, linearised, wrong_jacobians
 from vislam.sensors.registry import kind_class, register
 from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
@@ -20,6 +21,7 @@ __all__ = [
     "Begun",
     "BodyState",
     "Configured",
+    "Correlated",
     "Faults",
     "Linear",
     "Sensor",

@@ -91,6 +91,11 @@ def placed(body: BodyState, frame: Array, lever_m: Array) -> Placed:
     return Placed(turned + t, H, by_frame, by_lever)
 
 
+def is_heading_known(variables: Sequence[Variable], sigmas: Array) -> bool:
+    """Return whether a linear step is good at a frame's heading with these sigmas [V], or there is no frame."""
+    return all(s <= ENOUGH_YAW_RAD for v, s in zip(variables, sigmas, strict=True) if v.name == "yaw_rad")
+
+
 def wrapped(angle_rad: float) -> float:
     """Return an angle in (-pi, pi]."""
     return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
@@ -23,6 +24,19 @@ class Variable(NamedTuple):
     start: float = 0.0
     walk: float = 0.0  # per square root of a second; 0: it does not change
     of_machine: bool = True  # another run finds the same; False: it is of one run's world, as the heading of a frame
+    correlation_s: float = 0.0  # above 0: it forgets all but 1/e in this, and differs by `sigma` from `start`
+
+    @property
+    def changes(self) -> bool:
+        """Whether time changes it."""
+        return self.walk > 0.0 or self.correlation_s > 0.0
+
+    def after(self, dt_s: float) -> tuple[float, float]:
+        """Return which part of its distance from `start` is left after a time, and the variance that came meanwhile."""
+        if self.correlation_s > 0.0:
+            decay = math.exp(-max(dt_s, 0.0) / self.correlation_s)
+            return decay, self.sigma**2 * (1.0 - decay**2)
+        return 1.0, self.walk**2 * max(dt_s, 0.0)
 
 
 class Begun(NamedTuple):
@@ -43,6 +57,7 @@ class Sensor(ABC):
             elsewhere gives the same reading. Then the sliding window takes it, too, where the camera is blind.
         gives_fixes: its values are a point [3] in metres, in axes that stay: so they show motion from the first on.
         variables: own ones, estimated with the body's state by every estimator; each has its own values.
+        sources: all that `channel` may return.
         gate_probability: that a good reading passes the test of its innovation.
         regain_m: how far readings that the gate refused, but that agree, may move a filter at most; 0: never.
         slips: the columns that a slip of wheels makes larger; a sensor that has some is watched for slips.
@@ -55,6 +70,7 @@ class Sensor(ABC):
     gives_fixes: ClassVar[bool] = False
     slips: ClassVar[tuple[str, ...]] = ()
     variables: tuple[Variable, ...] = ()
+    sources: tuple[int, ...] = (0,)
     gate_probability: float = 0.999
     regain_m: float = 1000.0
     from_magnetometer: bool = False

@@ -43,7 +43,7 @@ def drawn_readings(
         name: of the sensor.
         sensor: that draws.
         bodies: the truth at each reading, in time order.
-        own: true own variables: [V] for all the time, or [N, V] one row for each body.
+        own: true own variables: [V] at first, of which those that forget wander on, or [N, V] one row for each body.
         seed: of noise and faults; the same one gives the same readings.
         faults: what goes wrong. Values that `check` refuses are drawn like others.
     """
@@ -53,7 +53,13 @@ def drawn_readings(
 def _drawn(
     name: str, sensor: Configured, bodies: Sequence[BodyState], own: Array, rng: np.random.Generator, faults: Faults
 ) -> Iterator[Reading]:
-    owns = np.broadcast_to(own, (len(bodies), len(sensor.variables)))
+    owns = np.array(np.broadcast_to(own, (len(bodies), len(sensor.variables))))
+    if own.ndim == 1 and (forgets := [n for n, one in enumerate(sensor.variables) if one.correlation_s > 0.0]):
+        for k in range(1, len(bodies)):
+            for n in forgets:
+                one, dt_s = sensor.variables[n], (bodies[k].t_ns - bodies[k - 1].t_ns) * 1e-9
+                decay, variance = one.after(dt_s)
+                owns[k, n] = one.start + decay * (owns[k - 1, n] - one.start) + variance**0.5 * rng.normal()
     last: Array | None = None
     for body, true_own in zip(bodies, owns, strict=True):
         since_s = (body.t_ns - bodies[0].t_ns) * 1e-9

@@ -26,7 +26,6 @@ class Suite:
         variables = [variable for sensor in self._sensors.values() for variable in sensor.variables]
         self.starts: Array = np.array([variable.start for variable in variables], dtype=np.float64)  # [K]
         self.sigmas: Array = np.array([variable.sigma for variable in variables], dtype=np.float64)  # [K]
-        self.walks: Array = np.array([variable.walk for variable in variables], dtype=np.float64)  # [K]
 
     def __len__(self) -> int:
         return len(self._sensors)
@@ -42,6 +41,11 @@ class Suite:
     def own(self, name: str) -> slice:
         """Return where a sensor's own variables stand among all of them."""
         return self._slices[name]
+
+    def after(self, name: str, dt_s: float) -> tuple[Array, Array]:
+        """Return decays [V] and variances [V] of a sensor's own variables, as `Variable.after` has them."""
+        decays, variances = np.array([variable.after(dt_s) for variable in self._sensors[name].variables]).T
+        return decays, variances
 
     def drawn_own(self, name: str, rng: np.random.Generator) -> Array:
         """Return true own variables [V] of a simulated sensor, as its starts and sigmas have them."""

@@ -15,6 +15,7 @@ from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probabili
 from vislam.core.errors import UsageError
 from vislam.core.reading import read_text
 from vislam.sensors.configured import Configured
+from vislam.sensors.correlated import Correlated
 from vislam.sensors.geodetic import Geodetic, why_nowhere
 from vislam.sensors.gnss.fixes import GnssSettings
 from vislam.sensors.registry import kind_class
@@ -62,6 +63,8 @@ class _Common:
     delay_s: NonNegative | None = None  # from a reading's time to its first byte there; None: 0.05 of a receiver, or 0
     gate_probability: Probability = 0.999
     regain_m: NonNegative = 1000.0  # that refused readings which agree may move the filter by at most; 0: never
+    correlated_sigma: float | tuple[float, ...] = ()  # of an error that neighbouring readings share; also one for all
+    correlation_s: NonNegative = 0.0  # in which that forgets all but 1/e
     known: dict[str, tuple[Finite, Positive]] | None = None  # own variables that are known: value and sigma
     ticks: TicksSettings | None = None
     gnss: GnssSettings | None = None
@@ -177,7 +180,13 @@ def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:
     sensor.gate_probability = common.gate_probability
     sensor.regain_m = common.regain_m
     sensor.variables = _with_known(sensor.variables, common.known or {}, where)
-    return sensor, common
+    if common.correlated_sigma == () and not common.correlation_s:
+        return sensor, common
+    told = common.correlated_sigma
+    try:
+        return Correlated(sensor, told if isinstance(told, tuple) else (told,), common.correlation_s), common
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from error
 
 
 def _with_known(

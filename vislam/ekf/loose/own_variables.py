@@ -12,7 +12,7 @@ from vislam.ekf.history import Outcome
 from vislam.ekf.loose import kernels
 from vislam.ekf.loose.state import LooseState
 from vislam.ekf.regain import grown
-from vislam.ekf.sensor_rows import Sensing, body_of
+from vislam.ekf.sensor_rows import OwnVariables, Sensing, body_of
 
 
 def begin(sensing: Sensing, state: LooseState, start: OwnStart, t_ns: int, out: Outcome) -> None:
@@ -29,16 +29,18 @@ def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gy
     The past moves as well, also where `odom` is continuous: a reading may show where in `odom` the body is, and that is
     no business of the clone.
     """
-    name = reading.sensor
-    rows = sensing.rows(reading, body_of(reading.t_ns, state.x, gyro_rad_s), state.own, out)
+    name, since_ns = reading.sensor, state.ledger.own_since_ns
+    x, P = state.x.copy(), state.P.copy()  # copies: a reading that the gate refuses leaves no walk behind
+    own = OwnVariables(x[kernels.NOMINAL :], P[kernels.ERRORS :, kernels.ERRORS :], since_ns)
+    sensing.grow(name, reading.t_ns, since_ns, own.values, P)
+    rows = sensing.rows(reading, body_of(reading.t_ns, x, gyro_rad_s), own, out)
     if rows is None:
         return
-    P, m = state.P.copy(), len(rows.residual)  # a copy: a reading that the gate refuses leaves no walk behind
-    sensing.grow(name, reading.t_ns, state.ledger.own_since_ns, P)
+    m = len(rows.residual)
     H = np.zeros((m, len(P)))
     H[:, :15], H[:, kernels.ERRORS :][:, sensing.suite.own(name)] = rows.H, rows.H_own
     everything = np.eye(len(P))
-    nis = kernels.update(state.x, P, H, np.eye(m), rows.residual, sensing.limit(name, m), everything)
+    nis = kernels.update(x, P, H, np.eye(m), rows.residual, sensing.limit(name, m), everything)
     watch = state.ledger.watch
     if not sensing.judge(name, nis, m, out):
         body = body_of(reading.t_ns, state.x, gyro_rad_s)
@@ -48,10 +50,10 @@ def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gy
             return
         sensing.regained(name, regain, out)
         P = grown(P, regain, np.eye(15), (3, 18), body.R_world_body[2])
-        state.x[0:3] += regain.place_m
-        state.x[3:6] += regain.velocity_m_s
-        state.x[16:19] += regain.place_m  # the clone
-    state.P = P
+        x[0:3] += regain.place_m
+        x[3:6] += regain.velocity_m_s
+        x[16:19] += regain.place_m  # the clone
+    state.x, state.P = x, P
     _note(state, name, reading.t_ns)
     state.ledger = replace(state.ledger, watch=watch.accepted(name, reading.t_ns, rows.H))
 

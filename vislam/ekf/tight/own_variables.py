@@ -35,13 +35,13 @@ def corrected_by_reading(
     """
     out, name = Outcome(), reading.sensor
     body = body_of(reading.t_ns, x, gyro_rad_s)
-    own = OwnVariables(window.own, window.P, window.own_since_ns)
+    P, values, at = window.P.copy(), window.own.copy(), sensing.suite.own(name)
+    sensing.grow(name, reading.t_ns, window.own_since_ns, values, P)
+    own = OwnVariables(values, P, window.own_since_ns)
     rows = sensing.rows(reading, body if ago_s == 0.0 else body.later(-ago_s), own, out)
     if rows is None:
         return window, out
-    P, at = window.P.copy(), sensing.suite.own(name)
-    sensing.grow(name, reading.t_ns, window.own_since_ns, P)
-    free = replace(window, P=P)
+    free = replace(window, own=values, P=P)
     H = np.zeros((len(rows.residual), len(P)))
     H[:, :INERTIAL] = rows.H @ by_now(body, ago_s) @ to_nav_error(x)
     H[:, window.first_own :][:, at] = rows.H_own

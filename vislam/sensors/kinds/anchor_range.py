@@ -62,6 +62,7 @@ class AnchorRange(Configured):
         """Take settings. Raises UsageError for anchors that are none."""
         self.settings = s = settings or AnchorRangeSettings()
         self._anchors = _numbered(s.anchors)
+        self.sources = tuple(self._anchors)
         frame = frame_variables(s.frame, up=(s.frame_z_m, s.frame_z_sigma_m))
         anchors: tuple[Variable, ...] = ()
         self._at: dict[int, int] = {}  # where an anchor's place stands among the own variables
