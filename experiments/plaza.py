@@ -34,7 +34,7 @@ from vislam.frontend.result import identity_motion, lost_motion
 from vislam.graph import PoseGraph
 from vislam.imu import ImuBuffer, ImuNoise
 from vislam.pipeline.reading_intake import ReadingIntake
-from vislam.sensors import BodyState, Sensor, Suite
+from vislam.sensors import BodyState, Correlated, Sensor, Suite
 from vislam.sensors.kinds.anchor_range import AnchorRange, AnchorRangeSettings
 from vislam.sensors.kinds.twist import Twist, TwistSettings
 from vislam.trajectory import Trajectory
@@ -100,11 +100,12 @@ class LevelFloor(Sensor):
         return np.diag([0.02, 0.02, 0.02]) ** 2
 
 
-def suite_for(plaza: Plaza, range_sigma_m: float) -> Suite:
-    """Return the sensors beside the gyroscope."""
+def suite_for(plaza: Plaza, range_sigma_m: float, shared: tuple[float, float] = (0.0, 0.0)) -> Suite:
+    """Return the sensors beside the gyroscope; with `shared`, ranges of an anchor err together by m, for s."""
     uwb = AnchorRangeSettings(anchors=plaza.anchors, sigma_m=range_sigma_m, scale_sigma=0.1, frame_z_sigma_m=0.01)
     wheels = TwistSettings(sigma_rad_s=10.0, sigma_m_s=0.05, slip=0.05)  # of their turn the gyroscope tells
-    return Suite({"uwb": AnchorRange(uwb), "wheels": Twist(wheels), "floor": LevelFloor()})
+    ranges = Correlated(AnchorRange(uwb), shared[:1], shared[1]) if shared[0] else AnchorRange(uwb)
+    return Suite({"uwb": ranges, "wheels": Twist(wheels), "floor": LevelFloor()})
 
 
 class Drive:
@@ -250,20 +251,22 @@ def _rms(errors: Array) -> float:
 
 
 def main(
-    out: Path | None = None, drives: tuple[int, ...] = (1, 2), range_sigma_m: float = 0.6, settled_s: float = 150.0
-) -> None:
+    out: Path | None = None, drives: tuple[int, ...] = (1, 2), range_sigma_m: float = 0.6, settled_s: float = 150.0,
+    shared: tuple[float, float] = (0.0, 0.0),
+) -> None:  # fmt: skip
     """Run the drives.
 
     Args:
         out: folder for results.json.
         drives: which of the two.
         range_sigma_m: of a range, once its scale is known.
+        shared: error that ranges of one anchor share: sigma in m, and s in which it forgets all but 1/e; 0: none.
         settled_s: errors count from then on: before, both look for the anchors' frame; the rest says `with_start`.
     """
     answer: dict[str, Any] = {}
     for number in drives:
         plaza = read(number)
-        drive = Drive(plaza, suite_for(plaza, range_sigma_m))
+        drive = Drive(plaza, suite_for(plaza, range_sigma_m, shared))
         by_filter, by_graph = drive.run()
         entry: dict[str, Any] = {"way_m": plaza.truth.path_m, "cpu_s": drive.cpu_s}
         for name, path in (("filter", by_filter), ("graph", by_graph)):

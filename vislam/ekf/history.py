@@ -25,6 +25,18 @@ class KnownBias(NamedTuple):
     values: Array  # [12] gyro, accel, and their sigmas
 
 
+class Innovation(NamedTuple):
+    """What a reading was off by."""
+
+    sensor: str
+    source: int  # of the sensor
+    t_ns: int
+    white: Array  # [m] over what it may be off by, uncorrelated
+    residual: Array  # [m]
+    noise: Array  # [m] variances of the sensor's
+    own_share: float  # of what it may be off by, that is the sensor's
+
+
 @dataclass(slots=True, eq=False)
 class Outcome:
     """What became of a measurement."""
@@ -34,6 +46,7 @@ class Outcome:
     reason: str = ""
     counts: dict[str, int] = field(default_factory=dict)
     statistics: Statistics = field(default_factory=dict)
+    innovation: Innovation | None = None  # of a reading that was accepted
 
     def count(self, name: str, number: int = 1) -> None:
         """Add to a counter."""

@@ -11,10 +11,10 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import UsageError
 from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
-from vislam.ekf.history import Outcome
+from vislam.ekf.history import Innovation, Outcome
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.regain import Refused, Regain, Watch
-from vislam.sensors import USER_ERRORS, BodyState, SensorError, Suite, linearised
+from vislam.sensors import USER_ERRORS, BodyState, Linear, SensorError, Suite, linearised
 
 _ENDS = (
     "accepted",
@@ -41,6 +41,7 @@ class Rows(NamedTuple):
     H: Array  # [m, 15] by the error of `NavState`
     H_own: Array  # [m, V]
     residual: Array  # [m]
+    linear: Linear  # as it was before
 
 
 class Sensing:
@@ -135,7 +136,8 @@ class Sensing:
             out.count(f"{name}_failed")
             out.reason = f"sensor {name!r} at {reading.t_ns} ns: noise that is not positive definite"
             return None
-        return Rows(*(np.linalg.solve(root, part) for part in (linear.H, linear.H_own, linear.residual)))
+        H, H_own, residual = (np.linalg.solve(root, part) for part in (linear.H, linear.H_own, linear.residual))
+        return Rows(H, H_own, residual, linear)
 
     def limit(self, name: str, degrees: int) -> float:
         """Return what the normalised innovation squared of a good reading stays below."""
@@ -144,12 +146,18 @@ class Sensing:
             self._limits[key] = chi_square_limit(self.suite[name].gate_probability, degrees)
         return self._limits[key]
 
-    def judge(self, name: str, nis: float, degrees: int, out: Outcome) -> bool:
-        """Write down what the gate finds; return whether the reading passes."""
+    def judge(self, reading: Reading, rows: Rows, S: Array, nis: float, out: Outcome) -> bool:
+        """Write down what the gate finds with a residual of covariance S [m, m]; return whether the reading passes."""
+        name, degrees = reading.sensor, len(S)
         limit, out.nis = self.limit(name, degrees), nis
         if nis <= limit:
             out.accept(f"{name}_accepted")
             out.test(name, 1, nis, degrees)
+            root, own = np.linalg.inv(np.linalg.cholesky(S)), rows.linear
+            out.innovation = Innovation(
+                name, self.suite[name].channel(reading.values), reading.t_ns, root @ rows.residual, own.residual,
+                np.diag(own.noise), float((root**2).sum()) / degrees,
+            )  # fmt: skip
             return True
         out.count(f"{name}_gated")
         out.reason = f"innovation {nis:.1f} of at most {limit:.1f}"

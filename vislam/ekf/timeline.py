@@ -20,6 +20,7 @@ from vislam.ekf.filter_core import Core, S
 from vislam.ekf.history import Checkpoint, Event, History, M, Outcome, Statistics, add_all
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.stretch import keep_track, stretch
+from vislam.ekf.whiteness import SharedError, Whiteness
 from vislam.imu import ImuSeries
 
 _CHECKPOINT_S = 0.05  # a rewind replays at most this much more than the delay, 4 kB each
@@ -44,6 +45,7 @@ class _Counting(Generic[S, M]):
     _history: History[S, M] | None
     _counts: dict[str, int]
     _statistics: Statistics
+    _whiteness: Whiteness
 
     @property
     def counters(self) -> dict[str, int]:
@@ -60,6 +62,15 @@ class _Counting(Generic[S, M]):
         sums = dict(self._statistics)
         add_all(sums, [] if self._history is None else self._history.events)
         return sums
+
+    @property
+    def shared_errors(self) -> dict[str, SharedError]:
+        """Return, by sensor, what its readings clearly err together by, though the filter took each for itself."""
+        return self._whiteness.shared([] if self._history is None else self._history.events)
+
+    def _forget(self, events: list[Event[M]]) -> None:
+        add_all(self._statistics, events)
+        self._whiteness.add(events)
 
     def _refuse(self, counter: str, reason: str) -> UpdateResult:
         self._counts[counter] += 1
@@ -91,7 +102,7 @@ class Timeline(_Counting[S, M]):
         self._applied = 0
         self._stops_at_event = False  # see `replayed_once`
         self._counts: dict[str, int] = dict.fromkeys(("imu_samples", "imu_gaps", *core.counters), 0)
-        self._statistics: Statistics = {}  # of events that the history has forgotten
+        self._statistics, self._whiteness = {}, Whiteness()  # of events that the history has forgotten
 
     @property
     def initialised(self) -> bool:
@@ -311,7 +322,7 @@ class Timeline(_Counting[S, M]):
         assert history is not None
         history.checkpoints.append(self._snapshot(after_event))
         if self._t_ns - history.checkpoints[0].t_ns > self._history_ns + 8 * self._checkpoint_ns:
-            add_all(self._statistics, history.forget_before(self._t_ns - self._history_ns))
+            self._forget(history.forget_before(self._t_ns - self._history_ns))
             self._series.forget_before(history.checkpoints[0].t_ns)
 
     def _restore(self, checkpoint: Checkpoint[S]) -> None:

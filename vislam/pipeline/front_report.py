@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -59,6 +60,7 @@ class FrontReport:
     told_noise: ImuNoise | None = None  # of the IMU
     track_noise: dict[str, Any] = field(default_factory=dict)  # of pixels: what tracks showed, and what was used for it
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # further ones, see `ReadingIntake.report`
+    shared_errors: Mapping[str, tuple[float, tuple[float, ...], float]] = field(default_factory=dict)  # by the filter
     first_t_ns: int = 0  # of the first frame
     is_confirmed: bool = True  # the start, by what came after it
     lost_reason: str = ""  # why vision lost most of the frames that it lost
@@ -221,7 +223,8 @@ def report_of(front: Front) -> FrontReport:
     if begun.phase is Phase.VISION_ALONE or floor is None:
         return report
     return replace(
-        report, nis=imu.filtering.ekf.nis_statistics, noise_warnings=floor.warnings(_NOISE_TOLERANCE),
+        report, nis=imu.filtering.ekf.nis_statistics, shared_errors=imu.filtering.ekf.shared_errors,
+        noise_warnings=floor.warnings(_NOISE_TOLERANCE),
         imu_noise=floor.summary(), noise_ratios=floor.ratios,
     )  # fmt: skip
 

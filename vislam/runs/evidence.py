@@ -65,6 +65,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         starts_taken_back=counters.get("initialisation", {}).get("taken_back", 0),
         is_confirmed=report.is_confirmed,
         innovations=report.nis,
+        shared_errors=report.shared_errors,
         keyframes=ekf.get("keyframes", 0),
         refused=sum(refused for _, refused in offered),
         offered=sum(taken + refused for taken, refused in offered),

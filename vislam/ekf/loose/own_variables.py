@@ -39,10 +39,11 @@ def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gy
     m = len(rows.residual)
     H = np.zeros((m, len(P)))
     H[:, :15], H[:, kernels.ERRORS :][:, sensing.suite.own(name)] = rows.H, rows.H_own
+    S = H @ P @ H.T + np.eye(m)
     everything = np.eye(len(P))
     nis = kernels.update(x, P, H, np.eye(m), rows.residual, sensing.limit(name, m), everything)
     watch = state.ledger.watch
-    if not sensing.judge(name, nis, m, out):
+    if not sensing.judge(reading, rows, S, nis, out):
         body = body_of(reading.t_ns, state.x, gyro_rad_s)
         watch, regain = sensing.refuse(watch, reading, rows, body, out)
         if regain is None:

@@ -48,7 +48,7 @@ def corrected_by_reading(
     S = H @ P @ H.T + np.eye(len(H))
     nis = float(rows.residual @ np.linalg.solve(S, rows.residual))
     since_ns = {**window.own_since_ns, name: reading.t_ns}
-    if sensing.judge(name, nis, len(H), out):
+    if sensing.judge(reading, rows, S, nis, out):
         window = corrected(free, x, H, rows.residual)
         return replace(window, own_since_ns=since_ns, watch=window.watch.accepted(name, reading.t_ns, rows.H)), out
     watch, regain = sensing.refuse(window.watch, reading, rows, body, out)

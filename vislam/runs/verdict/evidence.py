@@ -11,6 +11,10 @@ _LEAST_KNOWN = 0.2  # of the variance of the prior that a measurement took away
 
 Innovations = Mapping[str, tuple[int, float, int]]  # by kind: how many, the sum of their NIS, of their degrees
 
+# by sensor: how many times as large as the filter takes it the variance of many readings is, and what they err by
+# together: sigmas in the units of the residual, and seconds
+SharedErrors = Mapping[str, tuple[float, tuple[float, ...], float]]
+
 
 @dataclass(frozen=True, slots=True)
 class Moved:
@@ -94,6 +98,7 @@ class Evidence:
     scale_sigma: float = 0.0  # relative, of one camera's metres at the end; 0: they are known, or there are none
     # the filter
     innovations: Innovations = field(default_factory=dict)  # that were accepted
+    shared_errors: SharedErrors = field(default_factory=dict)  # of further sensors
     keyframes: int = 0
     refused: int = 0  # visual measurements
     offered: int = 0

@@ -30,6 +30,9 @@ _DEGRADED_SHARE = 0.2  # of the frames on which vision may lean weakly
 _MISSING_SHARE = 0.1  # of the frames that may never arrive: patches are followed over twice the interval then
 _REPEATED_FRAMES = 3  # images equal to the last bit in motion: one may be a hiccup, a stuck driver sends many
 _REFUSED_SHARE = 0.1  # of visual measurements that the filter may refuse: more than outliers explain
+# what readings of a sensor share may make the variance of many so much larger; alike for no longer than two of its
+# seconds, they may show how the body moves meanwhile
+_SHARED_EXCESS, _SHARED_S = 2.0, 2.0
 _CONTRADICTING_SHARE = 0.25  # of verified loops that the graph may refuse, as `graph/joining.py` does
 _UNIFORM_S = 20.0  # one camera without motion that shows scale: biases have walked away by then
 _SIGMA_M = 1.0  # of the filter's position at its worst: no controller can use it
@@ -196,6 +199,14 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             yield (
                 f"innovations of {kind.replace('_', ' ')} are {nis / degrees:.1f} times what the stated noise "
                 "explains: calibrate, or state more noise"
+            )
+    for name, (excess, sigmas, lasts_s) in e.shared_errors.items():
+        if excess > _SHARED_EXCESS and lasts_s > _SHARED_S:
+            given = f"{max(sigmas):.2g}" if len(set(sigmas)) == 1 else f"[{', '.join(f'{s:.2g}' for s in sigmas)}]"
+            yield (
+                f"readings of {name} err together for {lasts_s:.0f} s, so many of them have {excess:.1f} times the "
+                f"variance that the filter takes them to have: give [sensors.{name}] correlated_sigma = {given} and "
+                f"correlation_s = {lasts_s:.0f}, at least"
             )
     if e.sigma_m > _SIGMA_M:
         alone = ", for an IMU alone does not see the way: add wheels, fixes or a camera" if e.is_alone else ""
