@@ -215,7 +215,7 @@ class StreamJudge:
         self._rows, self._axes = Run(), AxisWatch(axes)
         self._of_axes: dict[str, list[StreamEvent]] = {}  # what happened to one alone, by its name
         self._taken: Sequence[float] = ()  # the newest row that was
-        self._leapt: tuple[int, Sequence[float]] | None = None  # the one after it, as long as none says why
+        self._leapt: tuple[int, Sequence[float]] | None = None  # the one after it, until the next shows why
         self._events: dict[Happening, list[StreamEvent]] = {}
         self._pace = _Pace(self, round(hole_s * _NS), rate_hz, recorded)
         self._sharp: deque[float] = deque(maxlen=_SHARP_OF)  # of the newest images, blurred ones left out
@@ -228,8 +228,8 @@ class StreamJudge:
         if (pause := self._pace.pending) is not None:
             known = known | {pause[0]: _joined(known.get(pause[0], []), StreamEvent(self.stream, *pause))}
         all_known = (e for some in (*known.values(), *self._of_axes.values()) for e in some)
-        told = (e for e in all_known if e.happening is not Happening.MOVING or e.rows >= _FEWEST)
-        return sorted(told, key=lambda e: (e.from_ns, e.happening))
+        shown = (e for e in all_known if e.happening is not Happening.MOVING or e.rows >= _FEWEST)
+        return sorted(shown, key=lambda e: (e.from_ns, e.happening))
 
     @property
     def steps_ns(self) -> list[int]:

@@ -30,7 +30,7 @@ _UNUSUAL = 10.0  # times the usual difference: vision errs by a few times of it 
 _TURN_RAD, _TURN_SHARE = np.deg2rad(0.5), 0.1  # that blurred images may be off by, and as much of the turn itself
 _MISTAKEN = 2.0  # times that without metres: a turn looks much like a motion to the side
 _FORCE_M_S2, _FORCE_SHARE = 1.0, 0.1  # the same of gravity: a place is off by a centimetre then
-# without metres, mean acceleration over half a second is not seen: of so much, and of so many times the usual
+# without metres, mean acceleration over half a second is not seen: as much may be, and as many times the usual
 _UNSEEN_M_S2, _UNSEEN = 5.0, 5.0
 _CALM = 3.0  # times the usual difference up to which nothing has begun yet
 _ENOUGH_S = 0.5  # of contradiction more than of agreement, for samples not to be believed ...

@@ -43,7 +43,7 @@ class Coasting:
         return self._t_ns[-1] if self._t_ns else None
 
     def follow(self, t_ns: int, T_vo_body: Array, sigma_m: float = 0.0) -> bool:
-        """Take a pose [4, 4] that was measured; one known worse than a jerk takes a body tells nothing, and is not."""
+        """Take a pose [4, 4] that was measured; one known worse than a jerk takes a body is left out."""
         if self._t_ns and (t_ns <= self._t_ns[-1] or sigma_m > self.jerked_m(t_ns)):
             return False
         self._learn(t_ns, T_vo_body)

@@ -213,7 +213,7 @@ class Front:
         """Return where visual odometry has a frame; as a keyframe also where only the filter knows the way."""
         track = self.frontend.track(frame, since.unbiased, since.gyro_sigma_rad_s, since.T_last_now)
         track = believed(track, self._chain, self.frontend) if self._imu is None else track
-        track = self._as_waypoint(frame, _told_blind(self._linked(frame, track), self.frontend.mode))
+        track = self._as_waypoint(frame, _as_blind(self._linked(frame, track), self.frontend.mode))
         return replace(track, vo=self.camera_clock.loosened(track.vo, since.span, since.state))
 
     def _linked(self, frame: Frame, track: TrackResult) -> TrackResult:
@@ -299,7 +299,7 @@ class Front:
         return report_of(self)
 
 
-def _told_blind(track: TrackResult, mode: str) -> TrackResult:
+def _as_blind(track: TrackResult, mode: str) -> TrackResult:
     """Return the track, as that of no camera where the front end has none."""
     return replace(track, vo=replace(track.vo, tracking=Tracking.BLIND)) if mode == "none" else track
 

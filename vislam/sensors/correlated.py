@@ -83,8 +83,8 @@ class Correlated(Configured):
     def begin(self, readings: Sequence[Reading], bodies: Sequence[BodyState]) -> Begun | None:
         """Return what the sensor begins with, as sure as readings that err together make it, and errors of none."""
         sensor, shared = self.sensor, np.diag(self._sigmas**2)
-        told = [sensor.noise(r.values) if r.covariance is None else r.covariance for r in readings]
-        readings = [replace(r, covariance=c + shared) for r, c in zip(readings, told, strict=True)]
+        noises = [sensor.noise(r.values) if r.covariance is None else r.covariance for r in readings]
+        readings = [replace(r, covariance=c + shared) for r, c in zip(readings, noises, strict=True)]
         found = sensor.begin(readings, bodies)
         if found is None:
             return None

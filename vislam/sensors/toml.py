@@ -182,9 +182,9 @@ def _sensor(table: dict[str, Any], where: str) -> tuple[Configured, _Common]:
     sensor.variables = _with_known(sensor.variables, common.known or {}, where)
     if common.correlated_sigma == () and not common.correlation_s:
         return sensor, common
-    told = common.correlated_sigma
+    given = common.correlated_sigma
     try:
-        return Correlated(sensor, told if isinstance(told, tuple) else (told,), common.correlation_s), common
+        return Correlated(sensor, given if isinstance(given, tuple) else (given,), common.correlation_s), common
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
 

@@ -204,8 +204,8 @@ def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
         if excess > _SHARED_EXCESS and lasts_s > _SHARED_S:
             given = f"{max(sigmas):.2g}" if len(set(sigmas)) == 1 else f"[{', '.join(f'{s:.2g}' for s in sigmas)}]"
             yield (
-                f"readings of {name} err together for {lasts_s:.0f} s, so many of them have {excess:.1f} times the "
-                f"variance that the filter takes them to have: give [sensors.{name}] correlated_sigma = {given} and "
+                f"readings of {name} err together for {lasts_s:.0f} s, and the mean of many has {excess:.1f} times the "
+                f"variance that the filter takes it to have: give [sensors.{name}] correlated_sigma = {given} and "
                 f"correlation_s = {lasts_s:.0f}, at least"
             )
     if e.sigma_m > _SIGMA_M:
