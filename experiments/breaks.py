@@ -27,6 +27,7 @@ import numpy as np
 
 from vislam.config import Config, load, validated
 from vislam.core.errors import VislamError
+from vislam.core.streams import Happening
 from vislam.experiment.recordings import open_cached
 from vislam.runs import execute
 from vislam.runs.folder import prepare, read_metrics
@@ -36,7 +37,12 @@ from vislam.sim.faults.faults import BREAKS, FAULTS, FaultyRecording
 _WRONG = 3.0  # times the clean error
 _SPARED = 1.5  # times the clean error, where what is left suffices
 _NAMED_S = 0.1
-_SELDOM = ("person", "clipped", "spikes")  # show only now and then: named from the first time on that they do
+_SELDOM = (
+    "person",
+    "clipped",
+    "spikes",
+    "disordered",
+)  # show now and then: named from the first time on
 _FROM, _TO = 0.35, 0.75  # of the length, between which moments are
 _CLEAN = "clean"
 _UNIFORM = "uniform"  # a motion of its own, not a fault of sensors
@@ -167,7 +173,13 @@ def is_named(entry: dict[str, Any]) -> bool:
     within_s = max(_NAMED_S, entry["interval_s"])
     late_s = math.inf if entry["fault"] in _SELDOM else within_s
     there = [event for event in entry["events"] if -within_s <= event["from_s"] - entry["from_s"] <= late_s]
-    kinds = {f"{event['stream'].split()[0]} {kind}" for event in there for kind in (event["happening"], "?")}
+    # a step forth differs from a hole only where another stream ends earlier
+    also = {Happening.STEP_FORTH: Happening.HOLE}
+    kinds = {
+        f"{event['stream'].split()[0]} {kind}"
+        for event in there
+        for kind in (event["happening"], also.get(event["happening"], "?"), "?")
+    }
     return entry["fault"] not in FAULTS or kinds.issuperset(FAULTS[entry["fault"]].named)
 
 
