@@ -22,21 +22,27 @@ _EVERY_S = 10.0
 def progress_bar(name: str, unit: str = "frames") -> Iterator[Callable[[int, int, str], None]]:
     """Show a progress bar on stderr, or a line now and then where that is no terminal.
 
-    It is told what is done, of how much, and a note.
+    It takes what is done, of how much, 0 where that is unknown, and a note.
     """
+
+    def share(done: int, total: int) -> str:
+        return f"{done}/{total} {unit}" if total else f"{done} {unit}"
+
     if not sys.stderr.isatty():
         say = _now_and_then()
-        yield lambda done, total, note: say(f"{name}: {done}/{total} {unit}  {note}".rstrip())
+        yield lambda done, total, note: say(f"{name}: {share(done, total)}  {note}".rstrip())
         return
     columns = (
         TextColumn(name),
         BarColumn(),
-        TextColumn(f"{{task.completed}}/{{task.total}} {unit}"),
+        TextColumn("{task.fields[share]}"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(name, note="")
-        yield lambda done, total, note: bar.update(task, completed=done, total=total, note=note)
+        task = bar.add_task(name, total=None, note="", share="")
+        yield lambda done, total, note: bar.update(
+            task, completed=done, total=total or None, note=note, share=share(done, total)
+        )
 
 
 @contextmanager

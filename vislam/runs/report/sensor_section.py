@@ -28,9 +28,8 @@ def sensors_section(run: RunFiles) -> str:
     in_graph = [row for name in sensors if (row := _in_graph(name, as_dict(sensors, name, "readings", "graph")))]
     graph_text = (
         "Used: in factors; in window: while the camera was blind; outliers, of those used, fail the sensor's gate at "
-        "the final estimate. Thinned: too many between two keyframes. Beginning: in the prior of own variables "
-        "instead. Not there: late, without inertial data, at the start of a submap, after the last keyframe, or from "
-        "before the graph."
+        "the final estimate. Beginning: in the prior of own variables instead. Not there: late, without inertial data, "
+        "at the start of a submap, after the last keyframe, or from before the graph."
     )
     variables = table(["sensor", "variable", "filter", "± σ", "graph", "± σ"], own, text_columns=(0, 1))
     return section(
