@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from vislam.cli import run_verb
-from vislam.cli.verbs import VERBS
+from vislam.cli.verbs import VERBS, terminal
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.brief import said_of
 from vislam.cli.verbs.completion import known_options, script
 from vislam.cli.verbs.live import ResumeOptions
-from vislam.cli.verbs.terminal import progress_bar
 from vislam.cli.verbs.web_page import PageOptions, opened
 from vislam.config.ranges import settings_of
 from vislam.core.errors import UsageError
@@ -155,8 +154,11 @@ def test_a_run_without_a_camera_is_evaluated_and_optimised_and_what_needs_images
         assert "camera" in said and "Traceback" not in said
 
 
-def test_progress_of_what_has_no_known_end_shows_what_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_of_what_has_no_known_end_shows_what_is_done(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "_EVERY_S", 0.0)
     for total, shown in ((0, "cart: 850 frames  blind"), (900, "cart: 850/900 frames  blind")):
-        with progress_bar("cart") as show:
+        with terminal.progress_bar("cart") as show:
             show(850, total, "blind")
         assert shown in capsys.readouterr().err
