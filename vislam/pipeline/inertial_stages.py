@@ -8,7 +8,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core.camera import Rig
-from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, ImuSpan, NavState, NoiseScale
+from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, ImuSpan, NavState, NoiseScale, Tracking
 from vislam.ekf.filtering import Filtering
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
@@ -55,8 +55,7 @@ class Inertial:
         self.buffer = ImuBuffer(config.imu, config.machine, noise)
         self.condition = ConditionWatch()
         self.filtering = Filtering(config.ekf, noise, config.machine, rig, suite)
-        self._rest, self._is_blind = RestDetector(config.init, noise), rig.is_blind
-        self._stillness, self._witness = Stillness(), MotionWitness()
+        self._rest, self._stillness, self._witness = RestDetector(config.init, noise), Stillness(), MotionWitness()
         self._is_corrected = config.ekf.vision != "none"
         self._gravity_m_s2, self._bias_walk = config.machine.gravity_m_s2, noise.gyroscope_random_walk
         self._at_frame: NavState | None = None  # the filter's state at the last frame
@@ -107,7 +106,7 @@ class Inertial:
 
         Without a camera: whether the samples were still, and whether the body rests by them and the filter's speed.
         """
-        if self._is_blind:
+        if track.vo.tracking is Tracking.BLIND:
             still, state = self._rest.add(span), self.filtering.state
             return still, still and state is not None and is_slow(state)
         still_image = self._stillness.add(track.vo.t_ns, track.observations)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections import deque
 from typing import Any
 
@@ -14,6 +15,7 @@ from vislam.sensors.kinds.driven import Driven
 
 _DELAYS_S = np.arange(-10, 11) * 0.05  # of the reading's stamp, that are tried
 _HALF_S = 0.025  # on either side of a reading the gyroscope's rate is averaged over
+_REACH_NS = round((_DELAYS_S[-1] + _HALF_S) * 1e9)  # on either side of a reading
 _KEPT_NS = 3_000_000_000  # of the gyroscope: readings may come late
 _NOW = len(_DELAYS_S) // 2  # the delay of none
 _LEAST = 200  # readings
@@ -34,7 +36,7 @@ class TurnWitness:
         zero = np.zeros(3)
         still = [BodyState(0, np.eye(3), zero, zero, zero, zero, rate) for rate in np.eye(3)]
         self._up = np.array([sensor.base_motion(body, own)[3] for body in still])
-        self._gyro = deque[tuple[int, float]]()  # time, and the angle turned up to it
+        self._gyro_ns, self._angles = list[int](), list[float]()  # times, and the angle turned up to each
         self._waiting = deque[tuple[int, float, float]](maxlen=_LEAST)  # time, speed and turn by the sensor
         self._N = np.zeros((len(_DELAYS_S), 3, 3))
         self._c = np.zeros((len(_DELAYS_S), 3))
@@ -54,16 +56,16 @@ class TurnWitness:
 
     def _turn(self, sample: ImuSample) -> None:
         """Compare the readings whose surroundings are known by now."""
-        t_ns, angle = self._gyro[-1] if self._gyro else (sample.t_ns, 0.0)
+        t_ns, angle = (self._gyro_ns[-1], self._angles[-1]) if self._gyro_ns else (sample.t_ns, 0.0)
         if sample.t_ns < t_ns or not np.isfinite(sample.gyro_rad_s).all():
             return
-        self._gyro.append((sample.t_ns, angle + (sample.t_ns - t_ns) * 1e-9 * float(self._up @ sample.gyro_rad_s)))
-        while sample.t_ns - self._gyro[0][0] > _KEPT_NS:
-            self._gyro.popleft()
-        reach_ns = round((_DELAYS_S[-1] + _HALF_S) * 1e9)
-        while self._waiting and self._waiting[0][0] + reach_ns <= sample.t_ns:
+        self._gyro_ns.append(sample.t_ns)
+        self._angles.append(angle + (sample.t_ns - t_ns) * 1e-9 * float(self._up @ sample.gyro_rad_s))
+        old = bisect_left(self._gyro_ns, sample.t_ns - _KEPT_NS)
+        del self._gyro_ns[:old], self._angles[:old]
+        while self._waiting and self._waiting[0][0] + _REACH_NS <= sample.t_ns:
             t_ns, speed_m_s, turn_rad_s = self._waiting.popleft()
-            if t_ns - reach_ns >= self._gyro[0][0]:
+            if t_ns - _REACH_NS >= self._gyro_ns[0]:
                 self._compare(t_ns, speed_m_s, turn_rad_s)
 
     def _drive(self, reading: Reading) -> None:
@@ -76,8 +78,10 @@ class TurnWitness:
             self._waiting.append((reading.t_ns, float(motion[0]), float(motion[3])))
 
     def _compare(self, t_ns: int, speed_m_s: float, turn_rad_s: float) -> None:
-        known = np.array([((at_ns - t_ns) * 1e-9, angle) for at_ns, angle in self._gyro])
-        before, after = (np.interp(side - _DELAYS_S, *known.T) for side in (-_HALF_S, _HALF_S))
+        first, last = bisect_right(self._gyro_ns, t_ns - _REACH_NS) - 1, bisect_left(self._gyro_ns, t_ns + _REACH_NS)
+        at_s = (np.array(self._gyro_ns[first : last + 1]) - t_ns) * 1e-9
+        angles = np.array(self._angles[first : last + 1])
+        before, after = (np.interp(side - _DELAYS_S, at_s, angles) for side in (-_HALF_S, _HALF_S))
         x = np.column_stack([np.ones_like(before), (after - before) / (2.0 * _HALF_S), np.full_like(before, speed_m_s)])
         self._N += x[:, :, None] * x[:, None]
         self._c += x * turn_rad_s

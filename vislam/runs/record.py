@@ -225,11 +225,9 @@ class _Recording:
                 self._write_waiting(0.0)
             if self._readings is not None:
                 recorded.notes += self._readings.notes()
-            events = [event for judge in self._judges.values() for event in judge.events]
-            recorded.events = [replace(event, done=_done(event)).entry(self._first_ns) for event in events]
-            recorded.notes += tuple(
-                replace(event, done=_done(event)).words(self._first_ns) for event in events[:_NAMED_EVENTS]
-            )
+            events = [replace(one, done=_done(one)) for judge in self._judges.values() for one in judge.events]
+            recorded.events = [event.entry(self._first_ns) for event in events]
+            recorded.notes += tuple(event.words(self._first_ns) for event in events[:_NAMED_EVENTS])
         except StorageError as error:
             recorded.ended = str(error)
             with suppress(StorageError, OSError):  # what went wrong first is what is reported
