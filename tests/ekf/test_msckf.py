@@ -19,7 +19,7 @@ from vislam.sim.points.points import open_points
 from vislam.trajectory import Trajectory, align, associate, ate
 from worlds.flight import CHEAP, MONO, RGBD, SIGMAS, STEREO, Flight, motion_of
 from worlds.motion import EUROC_NOISE, NS, T0_NS
-from worlds.parts import GRAVITY_M_S2, MACHINE
+from worlds.parts import GRAVITY_M_S2, MACHINE, with_slips
 
 NOTHING = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 
@@ -45,6 +45,19 @@ def test_follows_a_flight_with_outliers(rig: Rig) -> None:
     assert ekf.counters["soft_resets"] == 0
     assert ekf.dead_reckoning_s < 0.2
     assert np.linalg.eigvalsh(ekf.state().covariance)[0] > 0.0
+
+
+def test_slips_that_the_stated_noise_would_cover_are_left_out() -> None:
+    """A pixel is stated, a fifth of one is true, and a fifth of the corners slip by as much per frame; seeds 1, 3."""
+    errors_m = []
+    for share in (0.0, 0.2):
+        for seed in (1, 3):
+            flight = Flight.make(seed, 10.0, sigma_px=0.2, tracks=60)
+            t_ns, seen = zip(*flight.frames, strict=True)
+            slipped = with_slips(seen, share, 0.2, np.random.default_rng(seed))
+            errors_m.append(end_error_m(replace(flight, frames=list(zip(t_ns, slipped, strict=True))), flight.filter()))
+    print(f"position errors {np.round(errors_m, 4)} m")
+    assert sum(errors_m[2:]) < 2.0 * sum(errors_m[:2])
 
 
 def test_rolling_shutter_is_accounted_for() -> None:

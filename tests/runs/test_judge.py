@@ -51,7 +51,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"frames": 20, "frames_lost": 8}, "vision lost 8 of 20 frames"),
         ({"events": ("imu0: stuck at one value from 4.00 to 9.00 s",)}, "imu0: stuck at one value from 4.00 to 9.00 s"),
         ({"is_confirmed": False}, "the start was not confirmed"),
-        ({"scale_sigma": 0.08}, "one camera's metres are known to 8 % (1 sigma) only"),
+        ({"scale_sigma": 0.08}, "one camera's metres are known to 8.0 % (1 sigma) only"),
         ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),
         ({"frames_missing": 100}, "100 of 500 frames never arrived"),
         ({"frames_repeated": 40}, "40 images repeat the one before"),

@@ -53,7 +53,7 @@ def make_scene(rig, seed: int) -> Scene:
         rate=rng.normal(size=(count, 3)),
         applied_offset_s=rng.normal(size=count) * 1e-3,
         active=np.ones(CALIBRATION, dtype=np.bool_),
-        huber_k=1.5,
+        huber_k=np.full(3, 1.5),
         rho_information=0.01,
     )
     selection = tracks.select(np.arange(count))

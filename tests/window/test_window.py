@@ -15,7 +15,7 @@ from vislam.core.geometry import invert, se3_log
 from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
 from vislam.window import SlidingWindow, WindowUpdate, gate
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
-from worlds.parts import MACHINE
+from worlds.parts import MACHINE, with_slips
 from worlds.room import MONO, RGBD, STEREO, World, packet, start_state, told_way
 
 HONEST = replace(WindowConfig(), keyframes=8)  # the simulated sensor has no vibration
@@ -136,6 +136,22 @@ def test_outliers_are_taken_out() -> None:
         spoilt_m.append(position_rmse(updates, truths))
         assert sum(u.rejected_tracks for u in updates) > 0
     assert np.mean(spoilt_m) < 1.5 * np.mean(clean_m) + 0.02
+
+
+@pytest.mark.parametrize("rig", [MONO, STEREO], ids=["mono", "stereo"])
+def test_slips_that_the_stated_noise_would_cover_are_left_out(rig: Rig) -> None:
+    """A pixel is stated, a fifth of one is true, and a fifth of the corners slip by a third per keyframe."""
+    errors_m = []
+    for share in (0.0, 0.2):
+        for seed in (1, 2):
+            packets, truths = World(Motion.random(seed), rig, seed, duration_s=8.0, sigma_px=0.2).packets()
+            seen = with_slips([p.observations for p in packets], share, 0.3, np.random.default_rng(seed))
+            window = SlidingWindow(HONEST, rig, EUROC_NOISE, MACHINE)
+            window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed)))
+            updates = [window.add(replace(p, observations=o)) for p, o in zip(packets, seen, strict=True)]
+            errors_m.append(position_rmse(updates, truths))
+    print(f"position errors {np.round(errors_m, 4)} m")
+    assert sum(errors_m[2:]) < 1.2 * sum(errors_m[:2])
 
 
 def test_without_an_imu_stereo_is_bundle_adjustment() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vislam.config import MachineConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import transform
-from vislam.core.messages import Array, Frame, Keyframe
+from vislam.core.messages import Array, Frame, Keyframe, Observations
 
 MACHINE = MachineConfig()
 GRAVITY_M_S2 = MACHINE.gravity_m_s2
@@ -64,3 +65,21 @@ def ideal_imu(
     gyro = derivative(lambda s: (R.inv() * rotation(t + s)).as_rotvec(), np.zeros(1), 1e-3)
     acceleration = derivative(lambda s: derivative(position, s, 1e-3), t, 1e-3)
     return gyro, R.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
+
+
+def with_slips(
+    frames: Sequence[Observations], share: float, px_per_frame: float, rng: np.random.Generator
+) -> list[Observations]:
+    """Return what a camera saw as a tracker followed it of which a share of the corners slips, each its own way."""
+    born: dict[int, int] = {}
+    slips: dict[int, Array] = {}
+    out = []
+    for k, seen in enumerate(frames):
+        pixels = seen.pixels_px.copy()
+        for i, n in enumerate(seen.track_ids.tolist()):
+            if n not in born:
+                turn = rng.uniform(0.0, 2.0 * np.pi)
+                born[n], slips[n] = k, (rng.random() < share) * np.array([np.cos(turn), np.sin(turn)])
+            pixels[i] += px_per_frame * (k - born[n]) * slips[n]
+        out.append(replace(seen, pixels_px=pixels))
+    return out

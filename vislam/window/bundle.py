@@ -18,6 +18,7 @@ from vislam.core.camera import Rig
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, Observations
 from vislam.imu import ImuNoise, Preintegrated
+from vislam.window.doubt import spreads
 from vislam.window.equations import (
     CALIBRATION,
     STATE,
@@ -39,10 +40,8 @@ from vislam.window.tracks import RHO_START, TrackTable
 
 _ROUGH, _TOLERANCE = 1e-4, 1e-6  # relative decrease of the cost; the first until the pixels' noise is known
 _OUTLIER = 3.5  # standard deviations of a coordinate, by the length of the error
-_MEDIAN_LENGTH = 1.1774  # of a normal error in a plane, in standard deviations of a coordinate
 _SCALE_ROUNDS = 2  # tilt is linearised
 _FAR_OFF = 5.0  # factor of scale beyond which the shape is no good
-_SHARPEST = 0.05  # of the sigma that was told: no tracker is better, a fit to few views only looks so
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,9 +133,10 @@ def solve(
             break
         X, calibration = solution.X.copy(), solution.calibration
         errors = np.sqrt(solution.squares[:, 0]) * whitening
-        sigma = max(_spread(errors, len(points), count), _SHARPEST)
+        sigmas = spreads(solution, selection.views) * whitening
+        sigma = float(sigmas[0])
         whitening = sigma * problem.inflation
-        tracks.remove_rows(selection.rows[errors > _OUTLIER * sigma])
+        tracks.remove_rows(selection.rows[errors > _OUTLIER * sigmas[selection.views.camera]])
         selection = tracks.select(ids)
     return replace(
         _solution(problem, solution, links, gravity_m_s2),
@@ -157,7 +157,7 @@ def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig) -> Camera:
         rate=np.zeros((count, 3)) if problem.rate_rad_s is None else problem.rate_rad_s,
         applied_offset_s=np.zeros(count),
         active=active,
-        huber_k=config.huber_k,
+        huber_k=np.full(3, config.huber_k),
         rho_information=config.rho_sigma_1_m**-2,
     )
 
@@ -209,14 +209,6 @@ def _whitened_by(views: Views, sigma: float) -> Views:
     values = views.values.copy()
     values[:, 2:6] /= sigma
     return views._replace(values=values)
-
-
-def _spread(errors: Array, points: int, count: int) -> float:
-    """Return the sigma of one coordinate, given the lengths [N] of errors that points and poses were fitted to."""
-    if len(errors) == 0:
-        return 1.0
-    free = max(2 * len(errors) - 3 * points - 6 * count, len(errors) // 2)
-    return float(np.median(errors)) / _MEDIAN_LENGTH * float(np.sqrt(2 * len(errors) / free))
 
 
 def _solution(problem: BundleProblem, solution: Solution, links: Links, gravity_m_s2: float) -> BundleSolution:

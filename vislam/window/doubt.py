@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
 from vislam.window import gate
-from vislam.window.equations import Camera, Solution, visual
+from vislam.window.equations import Camera, Solution, Views, visual
 from vislam.window.keyframes import Keyframes
 from vislam.window.tracks import RHO_START, Selection, TrackTable
 
 _GATE_TRACK_FRACTION = 0.34  # of a track's observations beyond the gate: the whole track goes
 _GATE_PROBABILITY = 0.999  # chi-square of an observation; above it after optimisation, it is taken out
 _CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of wrong tracks, ...
+_LEAST_SPREAD = 0.05  # no tracker is better, a fit to few views only looks so
+_LEAST_VIEWS, _LEAST_TESTED = 3, 30  # of a landmark, and of all, before their scatter means anything
+_MEDIANS = 1.1774, 1.1774, 0.6745  # of the length of a normal error, in a plane and on a line
 _STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expectation
 
 
@@ -28,6 +31,7 @@ class Doubt:
         """Start without any."""
         self._gate = chi_square_limit(_GATE_PROBABILITY, 2)
         self._contradictions = 0  # keyframes in a row
+        self.spreads = np.ones(3)  # see the function, at most 1: stated sigmas cover errors that neighbours share, too
 
     def newest(
         self, tracks: TrackTable, keyframes: Keyframes, covariance: Array, calibration: Array, camera: Camera
@@ -58,7 +62,10 @@ class Doubt:
 
     def solved(self, tracks: TrackTable, selection: Selection, solution: Solution) -> int:
         """Take out views beyond the gate, and tracks with too many of them; return how many tracks."""
-        bad: NDArray[np.bool_] = solution.squares.max(axis=1, initial=0.0) > self._gate
+        squares, which = solution.squares, selection.views.camera
+        self.spreads = np.minimum(spreads(solution, selection.views), 1.0)
+        allowed = self._gate * np.column_stack((self.spreads[which], np.full(len(which), self.spreads[2]))) ** 2
+        bad: NDArray[np.bool_] = np.any(squares > allowed, axis=1)
         if not bad.any():
             return 0
         first = selection.views.first
@@ -67,3 +74,25 @@ class Doubt:
         hopeless |= bad[first[:-1]]  # the host's own view: without it the landmark has no bearing
         tracks.remove_rows(selection.rows[bad | np.repeat(hopeless, np.diff(first))])
         return int(hopeless.sum())
+
+
+def spreads(solution: Solution, views: Views) -> Array:
+    """Return the sigmas [3] of a pixel's error in either camera and of a depth's, whitened; 1 where few are seen.
+
+    By medians, so that as many as half may be outliers. Views that a landmark and poses were fitted to scatter less;
+    those of landmarks with fewer than three hardly at all, and do not count.
+    """
+    seen = np.diff(views.first)
+    poses = 1.0 - min(3.0 * len(solution.X) / max(len(views.camera), 1), 0.5)
+    loosened = 1.0 / np.sqrt(np.repeat(1.0 - 1.5 / np.maximum(seen, _LEAST_VIEWS), seen) * poses)
+    pixels, depths = (np.sqrt(solution.squares) * loosened[:, None]).T
+    counts = np.repeat(seen >= _LEAST_VIEWS, seen)
+    groups = (
+        pixels[counts & (views.camera == 0)],
+        pixels[counts & (views.camera == 1)],
+        depths[counts & (views.values[:, 8] > 0.0)],
+    )
+    found = [
+        np.median(g) / usual if len(g) >= _LEAST_TESTED else 1.0 for g, usual in zip(groups, _MEDIANS, strict=True)
+    ]
+    return np.maximum(np.array(found), _LEAST_SPREAD)

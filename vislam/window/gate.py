@@ -104,7 +104,8 @@ def innovations(
     own_block, inverse, cross = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, width))
     scratch = np.empty((2, 2, width))
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
+    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
+    active, huber_k = camera.active, camera.huber_k
     squares[:] = np.nan
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
@@ -119,7 +120,7 @@ def innovations(
                 seen = sight(landmark, at, mount, cam)
                 ahead, error = residual(seen.in_cam, rho, view)
                 if ahead:
-                    linearised(landmark, seen, view, active, k == host, error, camera.huber_k, J)
+                    linearised(landmark, seen, view, active, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
                     _add_older(J, view.depth_weight > 0.0, host, k, len(X), own_block, cross)
                 continue
             squares[n] = np.inf
@@ -175,7 +176,7 @@ def _best_depth(
         ahead, error = residual(seen.in_cam, rho, view)
         if not ahead:
             return np.nan
-        linearised(trial, seen, view, active, False, error, np.inf, J)
+        linearised(trial, seen, view, active, False, error, (np.inf, np.inf), J)
         if step < _DEPTH_STEPS:
             slope = J[0, POINT + 2] * error[0] + J[1, POINT + 2] * error[1] + rho_information * (rho - landmark.rho)
             curvature = J[0, POINT + 2] * J[0, POINT + 2] + J[1, POINT + 2] * J[1, POINT + 2] + rho_information

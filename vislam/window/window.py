@@ -174,7 +174,7 @@ class SlidingWindow:
             rate=keyframes.rate_rad_s,
             applied_offset_s=keyframes.applied_offset_s if active[0] else still,
             active=active,
-            huber_k=self._config.huber_k,
+            huber_k=self._config.huber_k * self._doubt.spreads,
             rho_information=self._config.rho_sigma_1_m**-2,
         )
 

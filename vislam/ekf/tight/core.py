@@ -44,9 +44,11 @@ _COUNTERS = (
     "tracks_few",
     "tracks_no_parallax",
     "tracks_range",
+    "tracks_outliers",  # for what tracks usually scatter; gated: for the stated noise
     "tracks_gated",
     "points_started",
     "points_used",
+    "points_outliers",
     "points_gated",
     "zero_velocity_accepted",
     "zero_velocity_gated",

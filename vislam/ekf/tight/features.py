@@ -27,7 +27,7 @@ _FAR_RHO = 1e-3  # 1/m: no parallax distinguishes such points from infinity
 _NEAR_RHO = 20.0  # 1/m
 _KERNEL = 3.0  # Cauchy, in standard deviations, while the point is found
 
-USED, FEW, PARALLAX, RANGE, GATED = 0, 1, 2, 3, 4
+USED, FEW, PARALLAX, RANGE, OUTLIER, GATED = 0, 1, 2, 3, 4, 5
 
 
 class Sensor(NamedTuple):
@@ -36,6 +36,7 @@ class Sensor(NamedTuple):
     sigmas: Array  # [3] pixels, disparity in pixels, inverse depth in 1/m
     R_cam1_cam0: Array  # [3, 3] rotation into the right camera
     t_cam1_cam0: Array  # [3] origin of cam0 in the right camera
+    spread: float = 1.0  # of whitened rows as they turn out, at most 1: outliers are judged by it
 
 
 class Views(NamedTuple):
@@ -69,7 +70,7 @@ class Tracks(NamedTuple):
 
     status: NDArray[np.int64]  # [F]
     points: Array  # [F, 3] m
-    tests: Array  # [F, 3] NIS, degrees of freedom, relative sigma of inverse depth
+    tests: Array  # [F, 4] NIS by the spread, degrees of freedom, relative sigma of inverse depth, NIS as whitened
     fixing: Array  # [F, 3, 3 + 6 C + 1] the rows that fix each point, as in `linearise`
     H_points: Array  # [F, 3, 3] and by the point
     rows: Array  # [m, 3 + 6 C + 1] the projected rows of all used tracks, stacked
@@ -83,7 +84,7 @@ def observe(y: Array, seen: Array, sensor: Sensor, r: Array, J: Array) -> int:
     """
     if not y[2] > 1e-6:
         return 0
-    sigmas, R_cam1_cam0, t_cam1_cam0 = sensor
+    sigmas, R_cam1_cam0, t_cam1_cam0, _ = sensor
     pixel, disparity, depth = sigmas[0] * seen[14], sigmas[1] * seen[14], sigmas[2] * seen[14]
     z = 1.0 / y[2]
     ex = seen[0] - y[0] * z
@@ -323,13 +324,20 @@ def project_out(A: Array, H_f: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def gate(H: Array, r: Array, P: Array) -> float:
-    """Return the normalised innovation squared of whitened rows; infinite where it cannot be computed."""
+def gate(H: Array, r: Array, P: Array, spread: float) -> tuple[float, float]:
+    """Return the normalised innovation squared of rows whose noise is `spread`, and of whitened ones.
+
+    Infinite where they cannot be computed.
+    """
     S = H @ P @ H.T
     for i in range(len(r)):
-        S[i, i] += 1.0
+        S[i, i] += spread * spread
     nis = float(r @ np.linalg.solve(S, r))
-    return nis if np.isfinite(nis) and nis >= 0.0 else np.inf
+    for i in range(len(r)):
+        S[i, i] += 1.0 - spread * spread
+    whitened = float(r @ np.linalg.solve(S, r))
+    good = np.isfinite(nis) and np.isfinite(whitened) and nis >= 0.0
+    return (nis, whitened) if good else (np.inf, np.inf)
 
 
 @njit(cache=True, nogil=True)
@@ -367,7 +375,7 @@ def process(
     clones = (len(P) - 3) // 6
     status = np.full(count, FEW)
     points = np.zeros((count, 3))
-    tests = np.zeros((count, 3))
+    tests = np.zeros((count, 4))
     fixing = np.zeros((count, 3, width))
     H_points = np.zeros((count, 3, 3))
     stack = np.empty((ROWS_MAX * len(at), width))
@@ -399,9 +407,9 @@ def process(
         A[3:, width - 1] += rest @ change
         residual = np.ascontiguousarray(A[3:, width - 1])
         tests[f, 1] = rows - 3
-        tests[f, 0] = gate(rest, residual, P)
+        tests[f, 0], tests[f, 3] = gate(rest, residual, P, sensor.spread)
         if not tests[f, 0] <= limits[rows - 3]:
-            status[f] = GATED
+            status[f] = OUTLIER if tests[f, 3] <= limits[rows - 3] else GATED
             continue
         status[f] = USED
         fixing[f] = A[:3]

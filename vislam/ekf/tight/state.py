@@ -63,6 +63,8 @@ class Window:
     misses: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # [S] frames in a row
     rest: Rest | None = None  # None: the body moves
     rested_t_ns: int = 0  # stamp of the newest frame at which it still rested
+    # [2] of tracks and of points, by how much whitened rows scatter as they turn out, at most 1
+    spread: Array = field(default_factory=lambda: np.ones(2))
     rejects: int = 0  # frames in a row whose tracks contradict the state
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0

@@ -61,10 +61,14 @@ _STATUS = {
     features.FEW: "tracks_few",
     features.PARALLAX: "tracks_no_parallax",
     features.RANGE: "tracks_range",
+    features.OUTLIER: "tracks_outliers",
     features.GATED: "tracks_gated",
 }
 _CONTRADICTED = 0.25  # of the tested tracks agree at most: the state is wrong, not the tracks
 _MIN_TESTED = 5
+_FOLLOWED_SHARE = 0.1  # by which a frame moves the spread of rows towards its own
+_RATIOS = 0.1, 10.0  # between which one frame counts
+_LEAST_SPREAD = 0.05  # no tracker is better
 _SMALL_SHARE = 0.05  # of the window's extent
 _SHORT_M = 0.02
 _SMALL_RAD = 0.01
@@ -79,6 +83,7 @@ class _Rows:
     at: NDArray[np.int64]  # [M] clone of each observation used
     row: NDArray[np.int64]  # [M]
     misses: NDArray[np.int64]  # [S]
+    spread: Array  # [2] see `Window`
     ids: NDArray[np.int64]  # [K], best known depth first
     points: Array  # [K, 3]
     ratios: Array  # [K]
@@ -141,7 +146,9 @@ class FrameUpdater:
             window, change, out.accepted = later, step, True
             if done:
                 break
-        window = replace(window, P=P, misses=rows.misses, frames=marked(prior.frames, rows.at, rows.row))
+        window = replace(
+            window, P=P, misses=rows.misses, spread=rows.spread, frames=marked(prior.frames, rows.at, rows.row)
+        )
         if out.accepted:
             window = replace(window, last_vision_t_ns=frame.t_ns, watch=window.watch.seen(frame.t_ns))
             window = self._keep_points(window, rows, out)
@@ -179,15 +186,17 @@ class FrameUpdater:
         at = np.full(len(found), newest, dtype=np.int64)
         views = self._views(window, at, frame.seen[row])
         prior = features.Prior(window.P, change)
-        H_points, r_points, tests = _point_rows(
-            found, window.points, views, self._point_sensor, prior, len(window.frames), self._limits
+        sensor = self._point_sensor._replace(spread=float(window.spread[1]))
+        H_points, r_points, tests, good = _point_rows(
+            found, window.points, views, sensor, prior, len(window.frames), self._limits
         )
-        good = tests[:, 1] > 0
         misses = window.misses + 1
         misses[found[good]] = 0
         out.count("points_used", int(good.sum()))
-        out.count("points_gated", int((~good).sum()))
-        out.test("points", int(good.sum()), float(tests[good, 0].sum()), int(tests[good, 1].sum()))
+        gated = tests[:, 2] > self._limits[tests[:, 1].astype(np.int64)]
+        out.count("points_outliers", int((~good & ~gated).sum()))
+        out.count("points_gated", int(gated.sum()))
+        out.test("points", int(good.sum()), float(tests[good, 2].sum()), int(tests[good, 1].sum()))
         unused = replace(window, frames=marked(window.frames, at, row))
         tracks = self._use_tracks(unused, leaving, change, out)
         return replace(
@@ -197,6 +206,7 @@ class FrameUpdater:
             at=np.concatenate((at, tracks.at)),
             row=np.concatenate((row, tracks.row)),
             misses=misses,
+            spread=np.array([tracks.spread[0], _followed(window.spread[1], tests)]),
         )
 
     def _use_tracks(self, window: Window, leaving: int | None, change: Array, out: Outcome) -> _Rows:
@@ -209,18 +219,19 @@ class FrameUpdater:
             nothing = np.zeros(0)
             no_ids = np.zeros(0, dtype=np.int64)
             return _Rows(
-                np.zeros((0, n)), nothing, no_ids, no_ids, no_ids, no_ids, np.zeros((0, 3)), nothing,
+                np.zeros((0, n)), nothing, no_ids, no_ids, no_ids, window.spread, no_ids, np.zeros((0, 3)), nothing,
                 np.zeros((0, 3, width + 1)), np.zeros((0, 3, 3)),
             )  # fmt: skip
         views = self._views(window, ripe.at, seen_at(window.frames, ripe.at, ripe.row))
         prior = features.Prior(np.ascontiguousarray(window.P[visible, visible]), np.ascontiguousarray(change[visible]))
+        sensor = self._sensor._replace(spread=float(window.spread[0]))
         status, points, tests, fixing, H_points, stack = features.process(
-            ripe.starts, views, self._sensor, prior, self._bounds, self._limits
+            ripe.starts, views, sensor, prior, self._bounds, self._limits
         )
         for code, name in _STATUS.items():
             out.count(name, int((status == code).sum()))
         used = status == features.USED
-        out.test("tracks", int(used.sum()), float(tests[used, 0].sum()), int(tests[used, 1].sum()))
+        out.test("tracks", int(used.sum()), float(tests[used, 3].sum()), int(tests[used, 1].sum()))
         H_stack, r_stack = compressed(stack[:, :-1], stack[:, -1])
         H = np.zeros((len(r_stack), n))
         H[:, visible] = H_stack
@@ -232,6 +243,7 @@ class FrameUpdater:
             ripe.at,
             ripe.row,
             window.misses,
+            np.array([_followed(window.spread[0], tests), window.spread[1]]),
             ripe.ids[fit],
             points[fit],
             tests[fit, 2],
@@ -273,7 +285,9 @@ class FrameUpdater:
 
     def _watch(self, window: Window, x: Array, t_ns: int, out: Outcome) -> Window:
         """Inflate the covariance when frame after frame contradicts the state."""
-        good = out.counts.get("tracks_used", 0) + out.counts.get("points_used", 0)
+        good = sum(
+            out.counts.get(f"{kind}_{what}", 0) for kind in ("tracks", "points") for what in ("used", "outliers")
+        )
         bad = out.counts.get("tracks_gated", 0) + out.counts.get("points_gated", 0)
         if good + bad < _MIN_TESTED:
             return window
@@ -293,6 +307,20 @@ class FrameUpdater:
         return without_points(fresh, np.ones(len(window.point_ids), dtype=np.bool_))
 
 
+def _followed(spread: float, tests: Array) -> float:
+    """Return how much rows scatter over their sigmas, after more tests [K, >= 2] of NIS by it and degrees of freedom.
+
+    By the median, so that as many as half may be outliers.
+    """
+    tested = tests[tests[:, 1] > 0]
+    if len(tested) < _MIN_TESTED:
+        return spread
+    degrees = tested[:, 1]
+    usual = degrees * (1.0 - 2.0 / (9.0 * degrees)) ** 3  # median of chi-square (Wilson and Hilferty, 1931)
+    step = float(np.clip(np.median(tested[:, 0] / usual), *_RATIOS)) ** (0.5 * _FOLLOWED_SHARE)
+    return float(np.clip(spread * step, _LEAST_SPREAD, 1.0))
+
+
 def _is_small(before: Window, after: Window, change: Array) -> bool:
     """Whether a step changed so little of the window's shape that linearising again would change nothing."""
     apart = np.abs(before.p - before.p[-1]).max()
@@ -309,17 +337,17 @@ def _point_rows(
     prior: features.Prior,
     clones: int,
     limits: Array,
-) -> tuple[Array, Array, Array]:
-    """Return whitened rows H [m, n] and r [m] of points of the state seen from the newest clone, and tests [K, 2].
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return whitened rows H [m, n] and r [m] of points of the state seen from the newest clone, and their tests.
 
-    A test is NIS and degrees of freedom; the latter 0 where it failed.
+    Tests [K, 3]: NIS by the spread, degrees of freedom, 0 behind the camera, NIS as whitened. Last, which passed [K].
     """
     _, seen, R_cam, centres = views
     P, change = prior
     n = len(P)
     H = np.zeros((features.ROWS_MAX * len(which), n))
     r_all = np.empty(features.ROWS_MAX * len(which))
-    tests = np.zeros((len(which), 2))
+    tests, good = np.zeros((len(which), 3)), np.zeros(len(which), dtype=np.bool_)
     r = np.empty(features.ROWS_MAX)
     J = np.empty((features.ROWS_MAX, 3))
     clone = 19 + 6 * (clones - 1)
@@ -331,6 +359,7 @@ def _point_rows(
         y = R_cam[k] @ (f - centres[k])
         rows = features.observe(y, seen[k], sensor, r, J)
         if rows == 0:
+            tests[k, 2] = np.inf
             continue
         by_point = J[:rows] @ R_cam[k]
         by_turn = by_point @ skew(f)
@@ -351,14 +380,14 @@ def _point_rows(
         for i in range(rows):
             for j in range(15):
                 residual[i] += h[i, j] * change[columns[j]]
-        nis = features.gate(h, residual, small)
-        tests[k, 0] = nis
-        if not nis <= limits[rows]:
-            continue
+        tests[k, 0], tests[k, 2] = features.gate(h, residual, small, sensor.spread)
         tests[k, 1] = rows
+        if not tests[k, 0] <= limits[rows]:
+            continue
+        good[k] = True
         for i in range(rows):
             for j in range(15):
                 H[m + i, columns[j]] = h[i, j]
             r_all[m + i] = residual[i]
         m += rows
-    return H[:m], r_all[:m], tests
+    return H[:m], r_all[:m], tests, good

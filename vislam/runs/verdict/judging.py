@@ -41,7 +41,7 @@ _APART_SIGMAS = 3.0
 _APART_SHARE = 0.005  # of the way: closer together than this they agree, whatever their covariances
 _MIN_FRAMES = 30  # before shares of them mean anything
 _FEW_LOST = 2  # frames, that any run may lose
-_SCALE_SIGMA = 0.05  # relative, of one camera's metres: a run of ten metres is off by half a metre then
+_SCALE_SIGMA = 0.025  # relative, of one camera's metres: one run of twenty is off by more than 5 %
 _MIN_LOOPS = 8
 _MIN_KEYFRAMES = 10
 _SOON_S = 0.05  # that things may wait without a remark
@@ -173,7 +173,7 @@ def _start(e: Evidence, _: VerdictConfig) -> Iterator[str]:
         yield "the start was not confirmed before the end: scale may err by more than its sigma; go on longer"
     if e.scale_sigma > _SCALE_SIGMA:
         yield (
-            f"one camera's metres are known to {100.0 * e.scale_sigma:.0f} % (1 sigma) only: move with more changes of "
+            f"one camera's metres are known to {100.0 * e.scale_sigma:.1f} % (1 sigma) only: move with more changes of "
             "speed, or use a second camera or depth"
         )
 

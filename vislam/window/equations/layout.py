@@ -79,7 +79,7 @@ class Camera(NamedTuple):
     rate: Array  # [M, 3] of the body at each keyframe, rad/s
     applied_offset_s: Array  # [M] time offset that is already in the stamp
     active: NDArray[np.bool_]  # [5] what is estimated
-    huber_k: float
+    huber_k: Array  # [3] of a pixel's error in either camera, and of a depth's, whitened
     rho_information: float  # of the prior of inverse depth
 
 

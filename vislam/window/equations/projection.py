@@ -160,15 +160,23 @@ def shift(applied_offset_s: Array, calibration: Array, k: int, row: float) -> fl
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def linearised(
-    landmark: Hosted, seen: Sight, view: Measured, active: Array, same: bool, error: Vec, huber_k: float, J: Array
+    landmark: Hosted,
+    seen: Sight,
+    view: Measured,
+    active: Array,
+    same: bool,
+    error: Vec,
+    huber_k: tuple[float, float],
+    J: Array,
 ) -> None:
     """Fill J [3, 24] with a view's whitened error and its derivative at a sight, robustly weighted.
 
-    `same` says that the host itself sees it. The third row is filled where a depth is measured.
+    `same` says that the host itself sees it. From `huber_k` on, of pixels and of depth, errors count less. The third
+    row is filled where a depth is measured.
     """
     z = seen.in_cam[2]
     x, y = seen.in_cam[0] / z, seen.in_cam[1] / z
-    weight = np.sqrt(robust(error[0] * error[0] + error[1] * error[1], huber_k)[0])
+    weight = np.sqrt(robust(error[0] * error[0] + error[1] * error[1], huber_k[0])[0])
     a, b = weight * view.white_xx / z, weight * view.white_xy / z
     for k in range(3):  # in a loop, for numba would compile the row again for each constant
         if k == 1:
@@ -178,7 +186,7 @@ def linearised(
         if k == 2:
             if not view.depth_weight > 0.0:
                 break
-            weight = np.sqrt(robust(error[2] * error[2], huber_k)[0])
+            weight = np.sqrt(robust(error[2] * error[2], huber_k[1])[0])
             slope = weight * view.depth_weight / z
             by_cam = (0.0, 0.0, -slope * landmark.rho / z)
         _row(landmark, seen, view.row, active, same, by_cam, J, k)

@@ -60,7 +60,7 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
                 squares[n, 0], squares[n, 1] = 1e6, 0.0
                 continue
             squares[n, 0], squares[n, 1] = e[0] * e[0] + e[1] * e[1], e[2] * e[2]
-            total += robust(squares[n, 0], huber_k)[1] + robust(squares[n, 1], huber_k)[1]
+            total += robust(squares[n, 0], huber_k[cameras[n]])[1] + robust(squares[n, 1], huber_k[2])[1]
     return 0.5 * total
 
 
@@ -90,7 +90,8 @@ def linearise(
     X, X_first, held = states
     mount, calibrated = mounted(camera, calibration), poses_at + 6 * len(X)
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
+    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
+    active, huber_k = camera.active, camera.huber_k
     J, ours, theirs = np.zeros((3, COLUMNS)), np.empty((POINT + 3, _OWN)), np.empty((6, COLUMNS))
     blocks, gradients, cross = landmarks.blocks, landmarks.gradients, landmarks.cross
     cross[:] = 0.0
@@ -118,7 +119,7 @@ def linearise(
                 ahead = residual(seen.in_cam, rho, view)[0]
             if not ahead:
                 continue
-            linearised(fixed, seen, view, active, k == host, error, camera.huber_k, J)
+            linearised(fixed, seen, view, active, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
             rows = 3 if view.depth_weight > 0.0 else 2
             _add_squares(J, rows, 0, ours)
             if k != host:
@@ -219,7 +220,8 @@ def _refine(
 ) -> None:
     """Move landmark p [3] by three Gauss-Newton steps with the poses fixed."""
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s, active = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.active
+    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
+    active, huber_k = camera.active, camera.huber_k
     host, row, J = hosts[p], values[first[p], 6], np.zeros((3, COLUMNS))
     H, b, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(3):
@@ -235,7 +237,7 @@ def _refine(
             ahead, error = residual(seen.in_cam, landmark.rho, view)
             if not ahead:
                 continue
-            linearised(landmark, seen, view, active, k == host, error, camera.huber_k, J)
+            linearised(landmark, seen, view, active, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
             for m in range(3 if view.depth_weight > 0.0 else 2):
                 for i in range(3):
                     b[i] += J[m, POINT + i] * J[m, ERROR]
