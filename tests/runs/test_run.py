@@ -104,6 +104,8 @@ def test_a_run_leaves_the_documented_folder(small_room, finished):
     assert 0.0 < cost["first_pose_cpu_s"] < cost["cpu_s"]
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
     assert metrics["accuracy"]["ekf"]["ate_rmse_m"] < 0.03
+    print(metrics["truth"]["summary"])
+    assert metrics["truth"]["error_m"] < 0.002 and "noise" in metrics["truth"]["summary"]  # it is exact
     assert json.loads((finished / "config.json").read_text())["view"]["enabled"] is True
     assert read_run(finished).unread == {}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array, NavState
 from vislam.core.trajectory import Trajectory
 from vislam.trajectory.evaluation import associate
+
+if TYPE_CHECKING:
+    from vislam.trajectory.truth_fit import TruthFit
 
 _HALF_WINDOW_NS = 150_000_000  # of the fit that gives true velocities: 1 mm of noise at 200 Hz becomes 4 mm/s
 _MAX_HALF_WINDOW_NS = 500_000_000  # a rarer truth has no velocity
@@ -43,21 +47,25 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
     return Consistency(total / freedom, low, high, count)
 
 
-def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) -> dict[str, Array]:
+def nees(
+    states: Sequence[NavState], truth: Trajectory, gravity: bool = True, fit: TruthFit | None = None
+) -> dict[str, Array]:
     """Return the normalised estimation error squared of states: "rotation", "position" and "velocity", [M], 3 dof each.
 
     Position and yaw of the first state (its attitude, without `gravity`) are a free choice, so the truth is brought
     into the states' world by them: the error there is zero and grows with drift, as the covariance does. Where that
     state was not certain of them, what it was wrong by moves and turns the truth, and its covariance joins that of
     every other state. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
-    The true velocity is that of a fit to the true positions, and its variance joins the state's; errors of the true
-    poses themselves count as the state's. NaN is what was not estimated, and the first state.
+    The true velocity is that of a fit to the true positions, and its variance joins the state's. By the `fit` of the
+    truth to the IMU what it is turned, displaced and late is undone, and its noise joins the covariances; other errors
+    of the true poses count as the state's. NaN is what was not estimated, and the first state.
     Raises DataError with fewer than 2 matching states.
     """
     estimate = Trajectory(
         np.array([s.t_ns for s in states], dtype=np.int64),
         np.array([s.T_world_body for s in states]).reshape(-1, 4, 4),
     )
+    truth, turn_rad, place_m = (truth, 0.0, 0.0) if fit is None else (fit.of_imu(truth), fit.noise_rad, fit.noise_m)
     pairs = associate(estimate, truth)
     if len(pairs) < 2:
         raise DataError(f"consistency needs 2 states within the truth, got {len(pairs)} of {len(states)}")
@@ -67,7 +75,7 @@ def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) ->
         R = Rotation.from_rotvec([0.0, 0.0, _heading_rad(R)]).as_matrix()
     true_R = R @ pairs.reference[:, :3, :3]
     true_p = (pairs.reference[:, :3, 3] - pairs.reference[0, :3, 3]) @ R.T + pairs.estimate[0, :3, 3]
-    velocity, velocity_variance = _velocities(truth, pairs.t_ns)
+    velocity, velocity_variance = _velocities(truth, pairs.t_ns, place_m)
     velocities = np.array([s.velocity_world_m_s for s in matched])
     errors = {
         "rotation": Rotation.from_matrix(pairs.estimate[:, :3, :3].transpose(0, 2, 1) @ true_R).as_rotvec(),
@@ -75,6 +83,7 @@ def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) ->
         "velocity": velocity @ R.T - velocities,
     }
     covariance = np.array([s.covariance for s in matched])
+    covariance[:, range(6), range(6)] += np.repeat([turn_rad**2, place_m**2], 3)  # also of the first true pose
     of_anchor = _of_anchor(pairs.estimate, velocities, covariance[0, :6, :6], gravity)
     results = {}
     for i, (name, error) in enumerate(errors.items()):
@@ -86,9 +95,9 @@ def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) ->
     return results
 
 
-def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistency]:
+def anees(states: Sequence[NavState], truth: Trajectory, fit: TruthFit | None = None) -> dict[str, Consistency]:
     """Return the average per degree of freedom of each `nees` that has a value; raises DataError as that does."""
-    finite = {name: values[np.isfinite(values)] for name, values in nees(states, truth).items()}
+    finite = {name: values[np.isfinite(values)] for name, values in nees(states, truth, fit=fit).items()}
     return {name: chi_square_mean(float(v.sum()), len(v), 3) for name, v in finite.items() if len(v)}
 
 
@@ -146,10 +155,11 @@ def _heading_rad(R: Array) -> float:
     return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
 
 
-def _velocities(truth: Trajectory, t_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+def _velocities(truth: Trajectory, t_ns: NDArray[np.int64], sigma_m: float) -> tuple[Array, Array]:
     """Return true velocities [N, 3], NaN near the ends and holes of the truth, and their variances [N].
 
-    A cubic in time is fitted to the true positions around each time; what it leaves over shows the noise of the truth.
+    A cubic in time is fitted to the true positions around each time; what it leaves over shows the noise of the truth,
+    which is not below `sigma_m`.
     """
     period_ns = float(np.median(np.diff(truth.t_ns))) if len(truth) > 1 else np.inf
     half_ns = max(_HALF_WINDOW_NS, 0.5 * _MIN_SAMPLES * period_ns)
@@ -164,7 +174,7 @@ def _velocities(truth: Trajectory, t_ns: NDArray[np.int64]) -> tuple[Array, Arra
         rest = truth.positions_m[first:last] - basis @ solution
         unit_variance = np.linalg.inv(basis.T @ basis)[1, 1] / (half_ns * 1e-9) ** 2
         velocity[i] = solution[1] / (half_ns * 1e-9)
-        variance[i] = unit_variance * float(np.sum(rest**2)) / (3 * (len(s) - 4))
+        variance[i] = unit_variance * max(float(np.sum(rest**2)) / (3 * (len(s) - 4)), sigma_m**2)
     return velocity, variance
 
 
