@@ -336,6 +336,15 @@ def test_black_images_end_as_tracking_lost(tmp_path):
 
 
 @pytest.mark.data
+def test_a_truth_is_fitted_once_where_vision_is_simulated_on_it(data_root, tmp_path):
+    """Vision and truth agree exactly then; what the real IMU sees otherwise is no error of the truth any more."""
+    recording = open_source(f"points:{data_root / 'euroc_v202_imu'},rig=stereo,duration_s=8,tracks=60,camera_hz=10")
+    metrics = run(recording, tmp_path / "run", map__enabled=False)
+    assert any(kind.endswith(": undone") for kind in metrics["problems"])
+    assert metrics["accuracy"]["graph"] and metrics["truth"] == {}
+
+
+@pytest.mark.data
 def test_two_seconds_of_real_stereo_and_imu(data_root, tmp_path):
     from vislam.datasets import open_dataset
 

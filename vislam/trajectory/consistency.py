@@ -65,7 +65,8 @@ def nees(
         np.array([s.t_ns for s in states], dtype=np.int64),
         np.array([s.T_world_body for s in states]).reshape(-1, 4, 4),
     )
-    truth, turn_rad, place_m = (truth, 0.0, 0.0) if fit is None else (fit.of_imu(truth), fit.noise_rad, fit.noise_m)
+    of_truth = np.zeros(3) if fit is None else np.array([fit.noise_rad, fit.noise_m, fit.velocity_m_s])
+    truth = truth if fit is None else fit.of_imu(truth)
     pairs = associate(estimate, truth)
     if len(pairs) < 2:
         raise DataError(f"consistency needs 2 states within the truth, got {len(pairs)} of {len(states)}")
@@ -75,7 +76,7 @@ def nees(
         R = Rotation.from_rotvec([0.0, 0.0, _heading_rad(R)]).as_matrix()
     true_R = R @ pairs.reference[:, :3, :3]
     true_p = (pairs.reference[:, :3, 3] - pairs.reference[0, :3, 3]) @ R.T + pairs.estimate[0, :3, 3]
-    velocity, velocity_variance = _velocities(truth, pairs.t_ns, place_m)
+    velocity, velocity_variance = _velocities(truth, pairs.t_ns)
     velocities = np.array([s.velocity_world_m_s for s in matched])
     errors = {
         "rotation": Rotation.from_matrix(pairs.estimate[:, :3, :3].transpose(0, 2, 1) @ true_R).as_rotvec(),
@@ -83,7 +84,7 @@ def nees(
         "velocity": velocity @ R.T - velocities,
     }
     covariance = np.array([s.covariance for s in matched])
-    covariance[:, range(6), range(6)] += np.repeat([turn_rad**2, place_m**2], 3)  # also of the first true pose
+    covariance[:, range(9), range(9)] += np.repeat(of_truth**2, 3)  # also of the first true pose
     of_anchor = _of_anchor(pairs.estimate, velocities, covariance[0, :6, :6], gravity)
     results = {}
     for i, (name, error) in enumerate(errors.items()):
@@ -137,17 +138,7 @@ def _of_anchor(poses: Array, velocities: Array, covariance: Array, gravity: bool
 
 def _cross(vectors: Array) -> Array:
     """Return the matrices [M, 3, 3] of the cross products with vectors [M, 3]."""
-    out = np.zeros((len(vectors), 3, 3))
-    for row, column, axis, sign in (
-        (0, 1, 2, -1),
-        (0, 2, 1, 1),
-        (1, 0, 2, 1),
-        (1, 2, 0, -1),
-        (2, 0, 1, -1),
-        (2, 1, 0, 1),
-    ):
-        out[:, row, column] = sign * vectors[:, axis]
-    return out
+    return np.cross(vectors[:, None], np.eye(3)).transpose(0, 2, 1)
 
 
 def _heading_rad(R: Array) -> float:
@@ -155,11 +146,10 @@ def _heading_rad(R: Array) -> float:
     return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
 
 
-def _velocities(truth: Trajectory, t_ns: NDArray[np.int64], sigma_m: float) -> tuple[Array, Array]:
+def _velocities(truth: Trajectory, t_ns: NDArray[np.int64]) -> tuple[Array, Array]:
     """Return true velocities [N, 3], NaN near the ends and holes of the truth, and their variances [N].
 
-    A cubic in time is fitted to the true positions around each time; what it leaves over shows the noise of the truth,
-    which is not below `sigma_m`.
+    A cubic in time is fitted to the true positions around each time; what it leaves over shows the noise of the truth.
     """
     period_ns = float(np.median(np.diff(truth.t_ns))) if len(truth) > 1 else np.inf
     half_ns = max(_HALF_WINDOW_NS, 0.5 * _MIN_SAMPLES * period_ns)
@@ -174,7 +164,7 @@ def _velocities(truth: Trajectory, t_ns: NDArray[np.int64], sigma_m: float) -> t
         rest = truth.positions_m[first:last] - basis @ solution
         unit_variance = np.linalg.inv(basis.T @ basis)[1, 1] / (half_ns * 1e-9) ** 2
         velocity[i] = solution[1] / (half_ns * 1e-9)
-        variance[i] = unit_variance * max(float(np.sum(rest**2)) / (3 * (len(s) - 4)), sigma_m**2)
+        variance[i] = unit_variance * float(np.sum(rest**2)) / (3 * (len(s) - 4))
     return velocity, variance
 
 

@@ -32,9 +32,7 @@ from vislam.imu.gyro_turns import integrate_gyro
 from vislam.imu.path import SmoothAttitude, apart, drift_knots, gaps, integrate_twice, mean_rate_ahead
 from vislam.trajectory.evaluation import Alignment, align, associate, ate
 
-_SURE = (
-    0.999  # of a turn, a lever or an offset that is taken for real: one recording in a thousand is changed by chance
-)
+_SURE = 0.999  # of a turn, a lever or an offset taken for real: one recording in a thousand is changed by chance
 _TURN_EVERY_S, _PLACE_EVERY_S = 0.1, 0.04  # true poses that are looked at
 _ARM_S = 0.5  # of the bend of the path, to either side: in less, a smoothed truth is the IMU again
 _NOISE_ARM_S = 0.05  # of what is left, and twice that: the IMU is better than any truth there
@@ -56,7 +54,7 @@ _LEVER = slice(14, 17)  # among the unknowns of a place
 _SHOWN = np.array([1e3, 180.0 / np.pi])  # mm and degrees
 _SHAPES = {"turn_rad": (3,), "turn_covariance": (3, 3), "lever_m": (3,), "lever_covariance": (3, 3)}
 _SHAPES |= dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "turn_offset_s", "noise_m", "unseen_m"), ())
-_SHAPES |= dict.fromkeys(("noise_rad", "unseen_rad", "jump_m"), ())
+_SHAPES |= dict.fromkeys(("noise_rad", "unseen_rad", "jump_m", "velocity_m_s"), ())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +69,8 @@ class TruthFit:
         noise_m: white noise of positions per axis, that of attitudes is `noise_rad`. `unseen_m`, `unseen_rad`: what the
             IMU's own noise would be taken for.
         jump_m: the largest jump of the position, 0 where none is beyond its noise.
+        velocity_m_s: by what its velocities over a tenth of a second and the IMU's differ per axis, 1 sigma, but for
+            white noise. What the IMU errs by within so short a time is in it.
     """
 
     turn_rad: Array
@@ -85,6 +85,7 @@ class TruthFit:
     noise_rad: float = 0.0
     unseen_rad: float = 0.0
     jump_m: float = 0.0
+    velocity_m_s: float = 0.0
 
     @classmethod
     def read(cls, entry: Any) -> TruthFit | None:
@@ -122,7 +123,8 @@ class TruthFit:
         sizes = zip(noise * _SHOWN, unseen * _SHOWN, ("mm", "deg"), strict=True)
         parts = [f"{s:.2g} {unit}" if s > u else f"below {np.hypot(s, u):.2g} {unit}" for s, u, unit in sizes]
         jump = [f"jumps of {1e3 * self.jump_m:.1f} mm"] if self.jump_m else []
-        return f"truth has noise of {', '.join(parts + jump)}" if self.unseen_m else ""
+        parts += [f"{1e3 * self.velocity_m_s:.1f} mm/s in velocity", *jump]
+        return f"truth has noise of {', '.join(parts)}" if self.unseen_m else ""
 
     @property
     def is_turned(self) -> bool:
@@ -182,9 +184,8 @@ def fit_truth(t_ns: NDArray[np.int64], gyro_rad_s: Array, accel_m_s2: Array, tru
         turn_P, lever_P = np.eye(3) * _TURN_SIGMA_RAD**2, np.eye(3) * _LEVER_SIGMA_M**2
         return TruthFit(np.zeros(3), turn_P, np.zeros(3), lever_P, 0.0, _OFFSET_SIGMA_S)
     zero_ns = int(truth.t_ns[inside[0]])
-    used = slice(
-        max(int(np.searchsorted(t_ns, zero_ns)) - 1, 0), int(np.searchsorted(t_ns, truth.t_ns[inside[-1]])) + 1
-    )
+    first, last = np.searchsorted(t_ns, truth.t_ns[inside[[0, -1]]])
+    used = slice(max(int(first) - 1, 0), int(last) + 1)
     imu_s = (t_ns[used] - zero_ns).astype(np.float64) * 1e-9
     true_s, poses = (truth.t_ns[inside] - zero_ns).astype(np.float64) * 1e-9, truth.T_world_body[inside]
     turns = apart(truth.t_ns[inside], _TURN_EVERY_S)
@@ -312,20 +313,24 @@ def _noise(imu_s: Array, turn: _Turn, accel: Array, true_s: Array, poses: Array,
     moved, rotated = ([e[after] - 2.0 * e[now] + e[before] for before, now, after in arms] for e in (off, turned))
     size = np.linalg.norm(moved[0], axis=1)
     is_jump = size.max() > _JUMP * np.quantile(size, 0.9) / _NINTH_OF_CHI3
-    return *_white(moved, 3), *_white(rotated, 1), float(size.max() * is_jump)
+    (noise_m, unseen_m, slow_m), (noise_rad, unseen_rad, _) = _white(moved, 3), _white(rotated, 1)
+    arm_s = 2.0 * max(_NOISE_ARM_S, period_s)
+    return noise_m, unseen_m, noise_rad, unseen_rad, float(size.max() * is_jump), slow_m / arm_s
 
 
-def _white(bends: list[Array], power: int) -> tuple[float, float]:
-    """Return the sigma per axis of white noise, and that which the IMU's noise looks like.
+def _white(bends: list[Array], power: int) -> tuple[float, float, float]:
+    """Return the sigma per axis of white noise, that which the IMU's noise looks like, and that of other change.
 
     Second differences [N, 3] over arms and over twice as long ones have the same variance by white noise; that by an
-    accelerometer's noise grows with the third `power` of the arm, by a gyroscope's with the first.
+    accelerometer's noise grows with the third `power` of the arm, by a gyroscope's with the first. Other change is that
+    over the longer arm.
     """
     squares = [np.einsum("ni,ni->n", errors, errors) for errors in bends]
     limits = [(_GROSS / _MEDIAN_OF_CHI3) ** 2 * np.median(square) for square in squares]
     variance, longer = (np.minimum(*pair).mean() / 3.0 for pair in zip(squares, limits, strict=True))
     white = np.clip((2**power * variance - longer) / (2**power - 1), 0.0, 0.99 * variance)  # as surely as it is known
-    return float(np.sqrt(white / 6.0)), float(np.sqrt((variance - white) / 6.0))
+    other = max(0.9 * float(longer) - float(white), 0.0)  # a tenth may be chance
+    return float(np.sqrt(white / 6.0)), float(np.sqrt((variance - white) / 6.0)), float(np.sqrt(other / 2.0))
 
 
 def _path(t_s: Array, acceleration: Array) -> CubicHermiteSpline:
