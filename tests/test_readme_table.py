@@ -49,6 +49,12 @@ def test_row_without_imu_or_truth_and_with_wrong_scale():
     assert cells({})[5:] == ["–", "– of –", "–", "–", "–", "– (– CPU)", "–"]
 
 
+def test_an_error_that_may_be_of_the_truth_has_the_error_of_the_truth_beside_it():
+    blurred = METRICS | {"truth": {"error_m": 0.0105}}
+    assert cells(blurred)[2:5] == ["0.019 (truth 0.011)", "0.022", "0.123"]
+    assert cells(METRICS | {"truth": {}})[2:5] == cells(METRICS)[2:5]
+
+
 def test_table_keeps_rows_that_failed():
     failed = readme_table.Outcome(ENTRY, None, "exit code 4: vislam: lost | no pose")
     lines = readme_table.table([readme_table.Outcome(ENTRY, METRICS), failed]).splitlines()

@@ -81,6 +81,7 @@ def test_inertial_recordings_are_inspected(data_root: Path) -> None:
 def test_the_doctor_tells_how_truth_fits_the_imu(data_root: Path) -> None:
     result = inspect(str(data_root / "euroc_v202_imu"))
     assert any("truth is turned by 0.6" in finding.what for finding in result.findings)
+    assert any("truth has noise of below 0.0" in finding.what for finding in result.findings)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from vislam.core.geometry import transform
 from vislam.core.messages import Frame, ImuSample, NavState
 from vislam.experiment.measures import nis_measures, output_measures
 from vislam.experiment.recordings import TimedRecording
-from vislam.trajectory import Trajectory, write_tum
+from vislam.trajectory import Trajectory, write_states_csv, write_tum
 from vislam.trajectory.consistency import anees, chi_square_mean, nees, stated_scale_sigma
+from vislam.trajectory.truth_fit import TruthFit
 
 RUN = {"has_imu": True, "mode": "stereo"}
 
@@ -136,6 +137,24 @@ def test_consistency_of_errors_drawn_from_their_covariance():
         for s in states_of(truth, covariance, 9, world)
     ]
     assert all(value.mean == pytest.approx(4.0, rel=0.1) for value in anees(states, truth).values())
+
+
+def test_states_are_judged_by_the_truth_as_the_imu_of_the_run_found_it(tmp_path):
+    truth = walk(400)
+    P = np.diag(np.repeat([0.01, 0.002, 0.005, 0.0, 0.0], 3) ** 2)
+    write_states_csv(tmp_path / "states_graph.csv", range(398), states_of(truth, P, 3, np.eye(4)))
+    write_tum(truth, tmp_path / "trajectory_graph.tum")
+    write_tum(Trajectory(truth.t_ns - 6_000_000, truth.T_world_body), tmp_path / "trajectory_truth.tum")
+    zero, tiny = np.zeros(3), np.eye(3) * 1e-6
+    fit = TruthFit(zero, tiny, zero, tiny, 0.006, 1e-4, 0.006, noise_m=1e-5, unseen_m=1e-6)
+    found = {}
+    for name, entry in {"came": {}, "fitted": fit.entry(truth, "yaw"), "damaged": {"turn_rad": 3}}.items():
+        found[name] = output_measures(tmp_path, ["graph"], RUN | {"truth": entry}, None)["graph"]
+    print(*(entry["anees"] for entry in found.values()))
+    assert found["came"]["anees"]["position"]["mean"] > 1.5 and found["came"]["judged_by"] == ""
+    assert found["fitted"]["anees"]["position"]["mean"] == pytest.approx(1.0, abs=0.15)
+    assert "off by +6.0" in found["fitted"]["judged_by"]
+    assert "damaged" in found["damaged"]["anees"]["failure"]
 
 
 def test_an_uncertain_first_state_does_not_make_the_others_inconsistent():

@@ -163,9 +163,11 @@ def test_what_batch_made_of_the_run_is_among_the_tiles(copy):
     metrics = json.loads((copy / "metrics.json").read_text())
     metrics["accuracy"]["batch"] = metrics["accuracy"]["graph"] | {"ate_rmse_m": 0.0123}
     metrics["batch"] = {"batch": {"cost_before": 542.6, "cost_after": 321.2}}
+    metrics["truth"] = {"summary": "truth is off by +6.0 +- 0.1 ms"}
     (copy / "metrics.json").write_text(json.dumps(metrics))
     page = Page(write_report(copy).read_text())
     assert {"ATE of the batch", "0.012", "321", "cost of the batch, 543 before"} <= set(page.texts)
+    assert "after all loops. truth is off by +6.0 +- 0.1 ms" in page.text
 
 
 def test_errors_of_the_scene_are_those_of_the_metrics(run):
@@ -288,7 +290,10 @@ def test_a_damaged_map_and_session_are_named_and_the_rest_is_still_there(copy, d
 def test_metrics_of_the_wrong_types_do_not_break_the_page(copy, drawn):
     nonsense = {"name": None, "frames": "many", "accuracy": {"graph": 3, "ekf": {"ate_rmse_m": None}}, "loops": []}
     nonsense |= {"timing_ms": {"ekf": {"p50": "fast"}, "x": 1}, "warnings": "none", "counters": {"a": {"b": "c"}}}
-    nonsense |= {"cost": {"cpu_ms_per_frame": "dear", "stages_cpu_ms_per_frame": {"ekf": "much", "map": 0.0}}}
+    nonsense |= {
+        "truth": "none",
+        "cost": {"cpu_ms_per_frame": "dear", "stages_cpu_ms_per_frame": {"ekf": "much", "map": 0.0}},
+    }
     (copy / "metrics.json").write_text(json.dumps(nonsense))
     assert "Trajectories" in Page(write_report(copy).read_text()).headings
 

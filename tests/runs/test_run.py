@@ -104,6 +104,8 @@ def test_a_run_leaves_the_documented_folder(small_room, finished):
     assert 0.0 < cost["first_pose_cpu_s"] < cost["cpu_s"]
     assert metrics["accuracy"]["graph"]["ate_rmse_m"] < 0.02
     assert metrics["accuracy"]["ekf"]["ate_rmse_m"] < 0.03
+    print(metrics["truth"]["summary"])
+    assert metrics["truth"]["error_m"] < 0.002 and "noise" in metrics["truth"]["summary"]  # it is exact
     assert json.loads((finished / "config.json").read_text())["view"]["enabled"] is True
     assert read_run(finished).unread == {}
 
@@ -331,6 +333,15 @@ def test_black_images_end_as_tracking_lost(tmp_path):
         execute(Edited(world, dark), load(None, FAST), tmp_path / "run", "test", [])
     assert error.value.exit_code == 4
     assert Path(tmp_path / "run" / "metrics.json").is_file()
+
+
+@pytest.mark.data
+def test_a_truth_is_fitted_once_where_vision_is_simulated_on_it(data_root, tmp_path):
+    """Vision and truth agree exactly then; what the real IMU sees otherwise is no error of the truth any more."""
+    recording = open_source(f"points:{data_root / 'euroc_v202_imu'},rig=stereo,duration_s=8,tracks=60,camera_hz=10")
+    metrics = run(recording, tmp_path / "run", map__enabled=False)
+    assert any(kind.endswith(": undone") for kind in metrics["problems"])
+    assert metrics["accuracy"]["graph"] and metrics["truth"] == {}
 
 
 @pytest.mark.data

@@ -345,7 +345,9 @@ class _Inspector:
         values = np.array([row[1] for row in rows]).reshape(-1, 6)
         fit = fit_truth(np.array([row[0] for row in rows], dtype=np.int64), values[:, :3], values[:, 3:], truth)
         if fit.summary:
-            self._add("ok", f"{fit.summary}; `points:` undoes it", "truth")
+            self._add("ok", f"{fit.summary}; `points:` and NEES undo it", "truth")
+        if fit.noise:
+            self._add("ok", fit.noise, "truth")
 
     def _check_truth(self, frames: FrameTable | None) -> None:
         if self._found.truth is None:

@@ -25,6 +25,7 @@ from vislam.trajectory import (
     read_tum,
 )
 from vislam.trajectory.consistency import anees, chi_square_mean, stated_scale_sigma
+from vislam.trajectory.truth_fit import TruthFit
 
 _STATES = {"ekf": "states_ekf.csv", "graph": "states_graph.csv", "batch": "states_batch.csv"}
 _STATES |= {name: f"states_{name}.csv" for name in ("causal", "final")}  # where an estimator by others gives them
@@ -78,7 +79,7 @@ def output_measures(
             continue
         states = run / _STATES.get(name, "none")
         if metrics["has_imu"] and states.is_file():
-            measures[name] |= _consistency(states, truth)
+            measures[name] |= _consistency(states, truth, metrics)
     return measures
 
 
@@ -156,11 +157,15 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _consistency(states: Path, truth: Trajectory) -> dict[str, Any]:
+def _consistency(states: Path, truth: Trajectory, metrics: dict[str, Any]) -> dict[str, Any]:
     try:
-        read = read_states_csv(states)[1]
-        found = {name: asdict(value) for name, value in anees(read, truth).items()}
-        return {"anees": found, "end_scale_sigma": stated_scale_sigma(read)}
+        read, fit = read_states_csv(states)[1], TruthFit.read(metrics.get("truth"))
+        found = {name: asdict(value) for name, value in anees(read, truth, fit).items()}
+        return {
+            "anees": found,
+            "judged_by": (metrics.get("truth") or {}).get("summary", ""),
+            "end_scale_sigma": stated_scale_sigma(read),
+        }
     except VislamError as error:
         return {"anees": {"failure": str(error)}}
 

@@ -323,11 +323,9 @@ class Run:
         evidence = self._evidence(front, final)
         verdict = judge(evidence, self.config.verdict)
         self.warnings += front.noise_warnings
-        errors: dict[str, Any] = {}
         found = self._found_in_map()
-        if truth is not None:
-            errors, not_compared = accuracy(self.log, final, truth, front.alignment)
-            self.warnings += not_compared
+        by_truth, not_compared = accuracy(self.log, final, truth, front.alignment, self._input.problems)
+        self.warnings += not_compared
         return {
             "name": self.recording.name,
             "verdict": verdict_entry(evidence, verdict),
@@ -346,7 +344,7 @@ class Run:
             "calibration": front.calibration,
             "imu_noise": front.imu_noise,
             "track_noise": front.track_noise,
-            "accuracy": errors,
+            **by_truth,
             "timing_ms": timing_ms,
             "cost": self.cost.entry(timing_ms),
             "counters": counters,

@@ -397,6 +397,10 @@ class RunLog:
         poses = dict(zip(ids, T_map_body, strict=True))
         return frames.placed(self._keyframe_t_ns, {i: poses[i] for i in ids if i in self._keyframe_t_ns})
 
+    def inertial_spans(self) -> list[ImuSpan]:
+        """Return the inertial samples between keyframes, in order."""
+        return [span for _, span in sorted(self._spans.items())]
+
     def odometry_trajectory(self) -> Trajectory:
         """Return the causal poses in odom: those of the filter, or of visual odometry without an IMU."""
         return self._causal([frame.T_odom_body for frame in self._frames])

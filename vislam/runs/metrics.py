@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vislam.core.errors import DataError, TrackingLostError, VislamError
+from vislam.core.messages import ImuSpan
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
 from vislam.runs.pipeline import FinalGraph
@@ -16,15 +20,17 @@ from vislam.trajectory import Alignment, Trajectory, evaluate
 _BEFORE = ("unusable", "too_early", "dropped", "beginning")  # readings that reached neither filter nor graph
 _BY_FILTER = ("accepted", "gated", "refused", "waiting", "failed")
 _BY_GRAPH = ("used", "in_window", "early")
+_SAMPLES = ("t_ns", "gyro_rad_s", "accel_m_s2")
 _NOT_IN_GRAPH = ("late", "unplaced", "crowded")
 
 
 def accuracy(
-    log: RunLog, final: Trajectory, truth: Trajectory, alignment: Alignment
+    log: RunLog, final: Trajectory, truth: Trajectory | None, alignment: Alignment, problems: Iterable[str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the errors of each trajectory by its name, and why some could not be compared with the truth."""
-    errors, warnings = {}, []
-    if len(log):
+    """Return the errors of each trajectory and how good the truth is, and why some could not be compared with it."""
+    errors: dict[str, Any] = {}
+    warnings: list[str] = []
+    if truth is not None and len(log):
         span = (int(log.stamps_ns[0]), int(log.stamps_ns[-1]))
         live = log.live_trajectory()  # empty where the run was not found in the map in which it began
         estimates = {"ekf": log.odometry_trajectory(), **({"live": live} if len(live) else {}), "graph": final}
@@ -33,7 +39,9 @@ def accuracy(
                 errors[name] = evaluate(estimate, truth, alignment, span_ns=span)
             except VislamError as error:
                 warnings.append(f"{name}: {error}")
-    return errors, warnings
+    is_undone = any(kind.endswith(": undone") for kind in problems)  # before vision was simulated on that truth
+    judged = {} if truth is None or is_undone else _truth_entry(log.inertial_spans(), truth, alignment)
+    return {"accuracy": errors, "truth": judged}, warnings
 
 
 def in_metres(final: Trajectory, from_ns: int, first_ns: int) -> tuple[Trajectory, str]:
@@ -114,6 +122,17 @@ def with_own_of_graph(sensors: dict[str, dict[str, Any]], graph: FinalGraph | No
         }
         for name, entry in sensors.items()
     }  # fmt: skip
+
+
+def _truth_entry(spans: Sequence[ImuSpan], truth: Trajectory, alignment: Alignment) -> dict[str, Any]:
+    """Return how good a truth is by inertial samples; empty without samples."""
+    if not spans:
+        return {}
+    from vislam.trajectory.truth_fit import fit_truth  # takes its time to be loaded
+
+    t_ns, gyro, accel = (np.concatenate([getattr(s, name) for s in spans]) for name in _SAMPLES)
+    first = np.unique(t_ns, return_index=True)[1]  # each span begins where the one before ended
+    return fit_truth(t_ns[first], gyro[first], accel[first], truth).entry(truth, alignment)
 
 
 def _in_filter(name: str, came: dict[str, int], ekf: dict[str, int]) -> dict[str, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array, NavState
 from vislam.core.trajectory import Trajectory
 from vislam.trajectory.evaluation import associate
+
+if TYPE_CHECKING:
+    from vislam.trajectory.truth_fit import TruthFit
 
 _HALF_WINDOW_NS = 150_000_000  # of the fit that gives true velocities: 1 mm of noise at 200 Hz becomes 4 mm/s
 _MAX_HALF_WINDOW_NS = 500_000_000  # a rarer truth has no velocity
@@ -43,21 +47,26 @@ def chi_square_mean(total: float, count: int, dof: int) -> Consistency:
     return Consistency(total / freedom, low, high, count)
 
 
-def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) -> dict[str, Array]:
+def nees(
+    states: Sequence[NavState], truth: Trajectory, gravity: bool = True, fit: TruthFit | None = None
+) -> dict[str, Array]:
     """Return the normalised estimation error squared of states: "rotation", "position" and "velocity", [M], 3 dof each.
 
     Position and yaw of the first state (its attitude, without `gravity`) are a free choice, so the truth is brought
     into the states' world by them: the error there is zero and grows with drift, as the covariance does. Where that
     state was not certain of them, what it was wrong by moves and turns the truth, and its covariance joins that of
     every other state. A fit over all states would hide drift, and find the first ones, which are surest, wrong.
-    The true velocity is that of a fit to the true positions, and its variance joins the state's; errors of the true
-    poses themselves count as the state's. NaN is what was not estimated, and the first state.
+    The true velocity is that of a fit to the true positions, and its variance joins the state's. By the `fit` of the
+    truth to the IMU what it is turned, displaced and late is undone, and its noise joins the covariances; other errors
+    of the true poses count as the state's. NaN is what was not estimated, and the first state.
     Raises DataError with fewer than 2 matching states.
     """
     estimate = Trajectory(
         np.array([s.t_ns for s in states], dtype=np.int64),
         np.array([s.T_world_body for s in states]).reshape(-1, 4, 4),
     )
+    of_truth = np.zeros(3) if fit is None else np.array([fit.noise_rad, fit.noise_m, fit.velocity_m_s])
+    truth = truth if fit is None else fit.of_imu(truth)
     pairs = associate(estimate, truth)
     if len(pairs) < 2:
         raise DataError(f"consistency needs 2 states within the truth, got {len(pairs)} of {len(states)}")
@@ -75,6 +84,7 @@ def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) ->
         "velocity": velocity @ R.T - velocities,
     }
     covariance = np.array([s.covariance for s in matched])
+    covariance[:, range(9), range(9)] += np.repeat(of_truth**2, 3)  # also of the first true pose
     of_anchor = _of_anchor(pairs.estimate, velocities, covariance[0, :6, :6], gravity)
     results = {}
     for i, (name, error) in enumerate(errors.items()):
@@ -86,9 +96,9 @@ def nees(states: Sequence[NavState], truth: Trajectory, gravity: bool = True) ->
     return results
 
 
-def anees(states: Sequence[NavState], truth: Trajectory) -> dict[str, Consistency]:
+def anees(states: Sequence[NavState], truth: Trajectory, fit: TruthFit | None = None) -> dict[str, Consistency]:
     """Return the average per degree of freedom of each `nees` that has a value; raises DataError as that does."""
-    finite = {name: values[np.isfinite(values)] for name, values in nees(states, truth).items()}
+    finite = {name: values[np.isfinite(values)] for name, values in nees(states, truth, fit=fit).items()}
     return {name: chi_square_mean(float(v.sum()), len(v), 3) for name, v in finite.items() if len(v)}
 
 
@@ -128,17 +138,7 @@ def _of_anchor(poses: Array, velocities: Array, covariance: Array, gravity: bool
 
 def _cross(vectors: Array) -> Array:
     """Return the matrices [M, 3, 3] of the cross products with vectors [M, 3]."""
-    out = np.zeros((len(vectors), 3, 3))
-    for row, column, axis, sign in (
-        (0, 1, 2, -1),
-        (0, 2, 1, 1),
-        (1, 0, 2, 1),
-        (1, 2, 0, -1),
-        (2, 0, 1, -1),
-        (2, 1, 0, 1),
-    ):
-        out[:, row, column] = sign * vectors[:, axis]
-    return out
+    return np.cross(vectors[:, None], np.eye(3)).transpose(0, 2, 1)
 
 
 def _heading_rad(R: Array) -> float:

@@ -11,7 +11,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from vislam.cli.verbs.arguments import parse
-from vislam.cli.verbs.results import print_evaluation
+from vislam.cli.verbs.results import print_evaluation, print_truth
 from vislam.cli.verbs.terminal import number, print_table
 from vislam.config import LoopTruthConfig
 from vislam.config.ranges import Share
@@ -44,6 +44,8 @@ OPTIONS = (EvalOptions,)
 
 def main(arguments: list[str]) -> int:
     """Evaluate a trajectory, those of a run folder, or its loops."""
+    from vislam.runs.folder import read_metrics
+
     options = parse(EvalOptions, arguments, "eval")
     if options.loops:
         return _eval_loops(options)
@@ -52,6 +54,8 @@ def main(arguments: list[str]) -> int:
         print(json.dumps(results))
     else:
         print_evaluation(results)
+        if options.reference is None:
+            print_truth(read_metrics(options.estimate))
     covered = min(entry["coverage"] for entry in results.values())
     if covered < options.min_coverage:
         raise TrackingLostError(

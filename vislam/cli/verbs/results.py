@@ -86,3 +86,11 @@ def _print_accuracy(metrics: dict[str, Any]) -> None:
     ]
     title = f"{metrics['name']} ({metrics['mode']}{', inertial' if metrics['has_imu'] else ''})"
     print_table(("trajectory", *columns, "covered"), rows, title)
+    print_truth(metrics)
+
+
+def print_truth(metrics: dict[str, Any]) -> None:
+    """Print how good the truth of a run is, where its metrics say it."""
+    truth = metrics.get("truth")
+    if isinstance(truth, dict) and truth.get("summary"):
+        Console().print(f"by the IMU, {printable(truth['summary'])}", soft_wrap=True, markup=False, highlight=False)

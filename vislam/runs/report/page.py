@@ -221,10 +221,11 @@ def _accuracy(run: RunFiles, scene: Scene) -> str:
     head = ["", "ATE RMSE [m]", "mean", "median", "max", "RPE 1 s [m]", "[°]", "scale", "coverage"]
     graph = as_dict(accuracy, "graph") or as_dict(accuracy, "ekf")
     causal = f"{scene.labels['ekf']} and live"
+    truth = str(as_dict(run.metrics, "truth").get("summary", ""))
     text = (
         f"Alignment {graph.get('alignment', 'unknown')} over a path of {number(graph.get('path_m'), 1)} m. "
         "Scale is the factor that would fit the estimate to the truth best. "
-        f"{causal} are causal; the graph is the final answer after all loops."
+        f"{causal} are causal; the graph is the final answer after all loops. {truth}"
     )
     return section("Accuracy", card(table(head, rows)), note(text), _consistency(scene))
 
@@ -246,7 +247,8 @@ def _consistency(scene: Scene) -> str:
     text = (
         f"Normalised estimation error squared of the keyframes, the first of which stands at its true position and "
         f"{'heading' if scene.has_gravity else 'attitude'}. An estimator that knows its own "
-        "uncertainty has a mean of 3; a larger number means that it is too sure of itself."
+        "uncertainty has a mean of 3; a larger number means that it is too sure of itself. Known errors "
+        "of the truth are taken into account."
     )
     return card(table(head, rows), title="Consistency (NEES, expected 3)") + note(text)
 

@@ -16,6 +16,7 @@ from vislam.runs.folder import recorded_alignment
 from vislam.runs.levelled import onto_map
 from vislam.runs.report.run_files import RunFiles, as_dict
 from vislam.trajectory import Trajectory, align, associate, nees
+from vislam.trajectory.truth_fit import TruthFit
 
 _LABELS = {"truth": "truth", "ekf": "EKF alone", "live": "live (causal)", "graph": "graph, final", "batch": "batch"}
 
@@ -120,6 +121,7 @@ def _add_nees(run: RunFiles, scene: Scene) -> None:
         return
     for name, states in run.states.items():
         try:
-            scene.nees[name] = nees(states, run.truth, scene.has_gravity)
+            fit = TruthFit.read(run.metrics.get("truth"))
+            scene.nees[name] = nees(states, run.truth, scene.has_gravity, fit)
         except VislamError as error:
             scene.notes.append(f"no consistency of {name}: {error}")
