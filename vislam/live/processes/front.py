@@ -199,7 +199,8 @@ class FrontProcess:
     def _process(self, frame: Frame) -> None:
         begun_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
         self._see(frame)
-        self._pace.took(frame, begun_ns, time.monotonic_ns(), time.thread_time_ns() - cpu_ns)
+        if self._silence is None:  # else it is late on purpose
+            self._pace.took(frame, begun_ns, time.monotonic_ns(), time.thread_time_ns() - cpu_ns)
 
     def _see(self, frame: Frame) -> None:
         live, waiting = self._config.live, len(self._to_back)
