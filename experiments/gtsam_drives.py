@@ -1,7 +1,7 @@
 """Real drives without a camera that come with GTSAM's package, as recordings for `vislam run` and the plans here.
 
-    python experiments/gtsam_drives.py --out drives
-    VISLAM_DRIVES=$PWD/drives vislam compare experiments/drives.toml
+    python experiments/gtsam_drives.py --out $VISLAM_DATA/drives
+    vislam compare experiments/drives.toml
 
 Plaza 1 and 2: a robot's gyroscope, wheels, and ranges to four surveyed anchors that are 7 % too long, 1.9 and 1.4 km
 (Djugash, Hamner and Roth, "Navigating with ranging radios: five data sets with ground truth", Journal of Field Robotics
