@@ -260,7 +260,8 @@ def test_shipped_plans_are_valid(path):
     jobs = expand(plan)
     assert plan.name == path.stem
     repeated = plan.members >= 6 or len(plan.seeds) >= 2  # one run of something chaotic says little
-    assert repeated or plan.name == "starts"  # many starts of one recording are an ensemble of their own
+    # many starts of one recording are an ensemble of their own; without a camera nothing is drawn by chance
+    assert repeated or plan.name in ("starts", "drives")
     assert len({job.label for job in jobs}) == len(jobs) > 0
     for source in some({job.source for job in jobs}):
         scheme, name, options = split_source(source)

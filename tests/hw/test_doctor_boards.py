@@ -147,7 +147,7 @@ def test_a_board_is_opened_by_its_name_and_the_settings(tmp_path: Path) -> None:
 def test_live_takes_a_board_and_its_calibration() -> None:
     biased = BoardConfig(calibration=SensorsConfig().board.calibration)
     source, _ = open_live("mpu9250+none", Config(), SensorsConfig(board=biased))
-    assert not source.has_camera
+    assert source.rig.is_blind
     assert source.imu_noise is not None
     assert source.imu_noise.rate_hz == 200.0
     assert with_raw_samples(SensorsConfig()).board.calibration == biased.calibration

@@ -179,7 +179,7 @@ def test_wrong_sources_are_told(asked: str, message: str) -> None:
 def test_sensors_without_a_camera_need_no_calibration_of_one() -> None:
     for asked in ("gy85+none", "serial:/dev/ttyUSB0+none", "virtual-cart,rig=none"):
         source, _ = open_live(asked, Config(), SensorsConfig())
-        assert not source.has_camera and "camera" not in source.helpers()
+        assert source.rig.is_blind and "camera" not in source.helpers()
         camera = source.cameras()()
         assert camera.read(0.0) is None and camera.health() == Health(0)
 

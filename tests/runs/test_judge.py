@@ -207,6 +207,11 @@ def test_frames_or_samples_alone_make_a_machine_too_slow(changes):
     assert found.state is Trust.DOUBTFUL and "too slow" in found.reasons[0]
 
 
+def test_where_no_frame_was_offered_the_machine_missed_samples_only():
+    (reason,) = verdict(samples=9000, samples_missed=2000).reasons
+    assert "sensors: 2000 of 11000 inertial samples missed: give it less to do" in reason
+
+
 def test_what_a_slow_machine_explains_is_not_told_of_the_sensors():
     reasons = verdict(**SLOW, rate_hz=120.0, rate_told_hz=200.0, frames_missing=500).reasons
     assert len(reasons) == 1 and "waited" not in reasons[0]

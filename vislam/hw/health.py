@@ -9,8 +9,8 @@ class Health(IntFlag):
     """32 bits. The low half is the state of the estimate, the high half faults of the sensors; 0 is not yet started."""
 
     LEVELLED = 1 << 0  # gravity is known
-    VISION_OK = 1 << 1  # vision corrects the filter
-    DEAD_RECKONING = 1 << 2  # no vision: inertial data, wheels' constraint and rest alone
+    VISION_OK = 1 << 1  # vision corrects the filter; without a camera, further sensors do
+    DEAD_RECKONING = 1 << 2  # nothing of that: inertial data, wheels' constraint and rest alone
     INVALID = 1 << 3  # position sigma is beyond the stated limit: do not steer by it
     AT_REST = 1 << 4
     MAG_OK = 1 << 5

@@ -41,12 +41,17 @@ def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
 def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None:
     """Return the beginning of a run that goes on in its folder; None where it had nothing yet to go on from.
 
-    Raises UsageError when its sensors are others now, or the machine was restarted, DataError when its session is
-    damaged.
+    Raises UsageError when its sensors are others now or none of them recognises a place, or the machine was restarted,
+    DataError when its session is damaged.
     """
     path = out / "session.db"
     if not has_begun(path):
         return None
+    if recording.rig.is_blind:
+        raise UsageError(
+            f"{out} was recorded without a camera, and no place tells where the cart is now; start a new run: vislam "
+            "live --out NEW"
+        )
     stored = Session(path)
     try:
         memory = recall(stored)

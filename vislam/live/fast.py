@@ -68,16 +68,16 @@ class FastPath:
         self._started = 0
         self._resets = 0  # states that took the place of another one, that of the IMU alone included
         self._at_rest = False
+        self._is_blind = config.frontend.mode == "none"  # there is no camera: further sensors take its place
         self._sees = False  # the newest frame was tracked
+        self._heard_ns = 0  # stamp of the newest reading that corrected the filter
         self._rejects = False  # ... and contradicted the filter
         self._settled_variance = 0.0  # of position, when vision last corrected
         self._map = MapMoved(0, np.eye(4))
         self._in_odom, self._in_map = in_odom(config), Continuity(config.publish)
         self._T_map_odom = np.eye(4)  # that `_in_map` follows
-        self._camera = Health(0)
-        self._doubt = Health(0)
+        self._said = dict.fromkeys((CameraHealth, Doubted), Health(0))
         self._events: deque[tuple[int, Health]] = deque()
-        self._looked_ns = 0
         self._sequence = 0
         self._newest: PublishedPose | None = None
 
@@ -114,7 +114,7 @@ class FastPath:
         self._gyro = value.gyro_rad_s
         if not self._started:
             self._alone.add(value)
-        return self._look_for_rest(value.t_ns)
+        return None if self._is_blind else self._look_for_rest(value.t_ns)
 
     def power_up(self, temperature_c: float | None) -> PowerUp | None:
         """Look whether the cart stands as it has to at power-up; return the result, once.
@@ -122,6 +122,12 @@ class FastPath:
         With vision already there only while the body rests. Called twice a second: it takes a third of a millisecond.
         """
         return self._alone.look(self._buffer, temperature_c) if not self._started or self._at_rest else None
+
+    @property
+    def _uncorrected_s(self) -> float:
+        """Seconds since vision, or without a camera a further sensor, corrected the filter."""
+        since_heard_ns = (self._buffer.newest_t_ns or 0) - self._heard_ns
+        return since_heard_ns / _NS if self._is_blind else self._ekf.dead_reckoning_s
 
     @property
     def bias_per_c(self) -> Array:
@@ -147,7 +153,9 @@ class FastPath:
             self._follow_vision(is_seen, answer.accepted, is_seen and not np.isnan(answer.nis) and not answer.accepted)
             self._at_rest = message.at_rest
         elif isinstance(message, AppliedReading):
-            message.apply(self._ekf)
+            if message.apply(self._ekf).accepted and self._is_blind:
+                self._heard_ns = max(self._heard_ns, message.t_ns)
+                self._follow_vision(True, True, False)
         elif isinstance(message, Rebase):
             self.counters["rebases"] += 1
             self._ekf.initialise(message.state)
@@ -159,10 +167,8 @@ class FastPath:
                 if message.is_in_map and not self._map.is_in_map:
                     self._in_map.clear()  # the place was found: map goes on from nothing
                 self._map = message
-        elif isinstance(message, CameraHealth):
-            self._camera = message.health
-        elif isinstance(message, Doubted):
-            self._doubt = Health.DOUBTFUL if message.is_doubtful else Health(0)
+        elif isinstance(message, CameraHealth | Doubted):
+            self._said[type(message)] = message.health
         else:
             self._start(message)
 
@@ -173,8 +179,7 @@ class FastPath:
             now_ns: CLOCK_MONOTONIC.
             look: asks the inertial sensor for its health word; called now and then.
         """
-        if now_ns - self._looked_ns >= _LOOK_NS:
-            self._looked_ns = now_ns
+        if not self._events or now_ns - self._events[-1][0] >= _LOOK_NS:
             self._events.append((now_ns, look()))
             while now_ns - self._events[0][0] > self._config.live.event_s * _NS:
                 self._events.popleft()
@@ -198,7 +203,7 @@ class FastPath:
         return PublishedPose(
             newest_ns, now_ns, self._sequence, self._health(state, now_ns, now_ns - newest_ns), T, velocity, rate,
             pose_covariance, twist_covariance, T_map_odom, self._map.revision, resets,
-            self._ekf.dead_reckoning_s,
+            self._uncorrected_s,
         )  # fmt: skip
 
     def _show(self, T_before: Array, state: NavState) -> tuple[Array, Array]:
@@ -220,8 +225,8 @@ class FastPath:
 
     def _health(self, state: NavState | None, now_ns: int, age_ns: int) -> Health:
         config = self._config.live
-        health = self._camera | self._doubt | (Health(0) if self._map.is_in_map else Health.NOT_IN_MAP)
-        for _, event in self._events:
+        health = Health(0) if self._map.is_in_map else Health.NOT_IN_MAP
+        for event in (*self._said.values(), *(event for _, event in self._events)):
             health |= event
         if age_ns > _IMU_TIMEOUT_S * _NS:
             health |= Health.IMU_MISSING | Health.INVALID
@@ -231,14 +236,15 @@ class FastPath:
             knows_up = Health.LEVELLED | Health.DEAD_RECKONING if self._alone.has_attitude else Health(0)
             return health | knows_up | Health.INVALID
         health |= Health.LEVELLED
-        sees = self._sees and self._ekf.dead_reckoning_s <= config.vision_timeout_s
+        sees = (self._sees or self._is_blind) and self._uncorrected_s <= config.vision_timeout_s
         health |= Health.VISION_OK if sees else Health.DEAD_RECKONING
         if self._at_rest:
             health |= Health.AT_REST
         if self._rejects:
             health |= Health.GATE_REJECT
         drifted = self._ekf.position_variance_m2 - self._settled_variance
-        if drifted > config.drift_sigma_m**2 or self._velocity_sigma(state) > config.velocity_sigma_m_s:
+        velocity_variance = np.trace(state.covariance[6:9, 6:9])
+        if drifted > config.drift_sigma_m**2 or velocity_variance > config.velocity_sigma_m_s**2:
             health |= Health.INVALID
         return health
 
@@ -278,7 +284,3 @@ class FastPath:
         self._ekf.hold(hint)
         self.counters["rests_without_vision" if hint.at_rest else "wheels_without_vision"] += 1
         return hint
-
-    @staticmethod
-    def _velocity_sigma(state: NavState) -> float:
-        return float(np.sqrt(np.trace(state.covariance[6:9, 6:9])))

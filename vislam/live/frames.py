@@ -6,9 +6,7 @@ import time
 from typing import Protocol
 
 import cv2
-import numpy as np
 
-from vislam.core.camera import Camera, Rig
 from vislam.core.messages import Frame
 from vislam.hw.health import Health
 from vislam.hw.source import ImageSource
@@ -64,11 +62,8 @@ class OneCamera:
         self._camera.close()
 
 
-NO_CAMERA = Rig((Camera(160, 120, 110.0, 110.0, 79.5, 59.5),), (np.eye(4),))  # stages are made for a rig, never fed
-
-
 class NoCamera:
-    """In the place of the cameras of a run by the IMU alone: no frame ever comes."""
+    """In the place of the cameras of a run without any: no frame ever comes."""
 
     def read(self, timeout_s: float) -> Frame | None:
         """Wait, and return None."""

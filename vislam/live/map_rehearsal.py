@@ -86,7 +86,7 @@ def _packet(k: int, frame: Frame, gravity_m_s2: float) -> KeyframePacket:
     side, height = rng.uniform(-1.5, 1.5, _POINTS), rng.uniform(_FLOOR_M, 1.0, _POINTS)
     points = np.stack([np.full(_POINTS, _WALL_M), side, height], axis=1)
     points[::2, 0], points[::2, 2] = rng.uniform(0.5, _WALL_M, len(points[::2])), _FLOOR_M
-    size = np.array(frame.images[0].shape[::-1])
+    size = np.array(frame.images[0].shape[::-1] if frame.images else (8, 8))
     keyframe = Keyframe(
         k, frame.t_ns, replace(frame, index=k), rng.uniform(0.0, size - 1.0, (_POINTS, 2)),
         rng.integers(0, 255, (_POINTS, 32), np.uint8), points,

@@ -40,6 +40,11 @@ class Doubted:
 
     is_doubtful: bool
 
+    @property
+    def health(self) -> Health:
+        """DOUBTFUL or nothing."""
+        return Health.DOUBTFUL if self.is_doubtful else Health(0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapMoved:

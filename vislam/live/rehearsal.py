@@ -9,7 +9,7 @@ from math import sin
 import numpy as np
 
 from vislam.config import Config
-from vislam.core.camera import Rig
+from vislam.core.camera import Camera, Rig
 from vislam.core.clock import StageClock
 from vislam.core.geometry import transform
 from vislam.core.messages import Frame, ImuSample
@@ -29,11 +29,12 @@ _POINTS = 40
 _SAMPLES = 5  # per frame
 _SPEED_M_S, _SWAY_RAD_S = 0.8, 3.0
 _DEPTH_M = 2.0
+_NOBODYS = Camera(8, 8, 8.0, 8.0, 4.0, 4.0)  # without one, frames have no image
 
 
 def rehearse_front(config: Config, rig: Rig, noise: ImuNoise) -> None:
     """Run the front half once, and its filter through a longer rest."""
-    warm_up(config, noise, rig.T_body_cams[0])
+    warm_up(config, noise, rig.T_body_cam0)
     _see_direction()
     front = Front(_patient(config), rig, noise, StageClock())
     for value in made_up(config, rig):
@@ -84,13 +85,13 @@ def _see_direction() -> None:
 def made_up(config: Config, rig: Rig) -> Iterator[ImuSample | Frame]:
     """Yield a body at rest, then going along a wall by fits and starts, as true to the IMU: keyframes, and loops."""
     rng = np.random.default_rng(0)
-    camera = rig.cameras[0]
+    camera = rig.cameras[0] if rig.cameras else _NOBODYS
     px_per_m = camera.fx / _DEPTH_M
     width = camera.width + round(_gone(_FRAMES * _FRAME_NS)[0] * px_per_m) + 1
     coarse = rng.integers(0, 255, (camera.height // 8 + 1, width // 8 + 2), np.uint8)
     wall = np.kron(coarse, np.ones((8, 8), np.uint8))
     depth = np.full((camera.height, camera.width), _DEPTH_M, np.float32) if rig.has_depth else None
-    aside, gravity = rig.T_body_cams[0][:3, 0], np.array([0.0, 0.0, config.machine.gravity_m_s2])
+    aside, gravity = rig.T_body_cam0[:3, 0], np.array([0.0, 0.0, config.machine.gravity_m_s2])
     for k in range(_FRAMES):
         for j in range(_SAMPLES):
             t_ns = (k * _SAMPLES + j) * _FRAME_NS // _SAMPLES

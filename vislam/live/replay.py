@@ -18,7 +18,7 @@ from vislam.core.readings import Reading
 from vislam.core.recording import Recording
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
-from vislam.live.frames import FrameSource
+from vislam.live.frames import FrameSource, NoCamera
 from vislam.live.processes.child import Life
 from vislam.live.reading_source import ReadingSource, ReplayedReadings, refuse_unread
 from vislam.live.replayed_imu import InertialTable, ReplayedImu
@@ -31,6 +31,7 @@ from vislam.trajectory import Trajectory
 _NS = 1_000_000_000
 _NO_FRAMES_NS = 1 << 62
 _CAMERA_TIMEOUT_NS = 1_000_000_000
+_BEGIN_S = 1.0  # most that it takes all processes to begin: none of the recording is left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +66,9 @@ class ReplaySource:
         if recording.imu_noise is None:
             raise DataError(f"{uri} has no inertial data to play")
         self._table = _inertial_table(recording, uri, recording.imu_noise.rate_hz)
-        self.duration_s: float | None = float(self._table.t_ns[-1] - self._table.t_ns[0]) / _NS
+        self.duration_s: float | None = float(self._table.t_ns[-1] - self._table.t_ns[0]) / _NS + _BEGIN_S
         self._zero_ns = int(self._table.t_ns[0])
-        self.has_camera, self.is_mag_calibrated = True, False  # its magnetometer is not played
+        self.is_mag_calibrated = False  # its magnetometer is not played
         self._uri, self._seed = uri, seed
         self._outages = outages or Outages()
         self._epoch = Epoch()
@@ -81,6 +82,8 @@ class ReplaySource:
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what plays the frames."""
+        if self.rig.is_blind:
+            return NoCamera
         return partial(ReplayedFrames, self._open, self._zero_ns, self._epoch, self._outages.camera)
 
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:

@@ -48,7 +48,6 @@ class LiveSource(Recording, Protocol):
     """Sensors: what a recording states of itself, and how to open them, each in the process that reads it."""
 
     duration_s: float | None  # after which there is no more; None: endless
-    has_camera: bool  # without one, attitude alone is published
     is_mag_calibrated: bool  # without, a magnetometer is not believed
 
     def check(self) -> None:
@@ -155,7 +154,7 @@ class LiveRun:
         fast = replace(config, live=replace(config.live, send_to=send_to))
         ours: dict[str, Callable[[Life], None]] = {
             "fast": partial(
-                fast_process.run, config=fast, noise=noise, T_body_camera=rig.T_body_cams[0],
+                fast_process.run, config=fast, noise=noise, T_body_camera=rig.T_body_cam0,
                 open_source=source.inertial(), samples=samples_in, inbox=[fast_hears_front, fast_hears_back],
                 memory=self._bias.memory, is_mag_calibrated=source.is_mag_calibrated, suite=suite,
             ),
@@ -170,7 +169,7 @@ class LiveRun:
             ),
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,
-                frames=frames, keyframes=keyframes, beginning=beginning, base=base, has_camera=source.has_camera,
+                frames=frames, keyframes=keyframes, beginning=beginning, base=base, suite=suite,
                 web=None if web is None else web.map,
             ),
         }  # fmt: skip

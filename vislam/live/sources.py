@@ -23,7 +23,7 @@ from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, ope
 from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
 from vislam.live.device_owner import own_device
-from vislam.live.frames import NO_CAMERA, FrameSource, NoCamera, OneCamera
+from vislam.live.frames import FrameSource, NoCamera, OneCamera
 from vislam.live.handed_frames import HandedFrames
 from vislam.live.handed_imu import HandedImu
 from vislam.live.port_readings import PortReadings
@@ -77,7 +77,7 @@ def open_live(asked: str, config: Config, sensors: SensorsConfig) -> tuple[LiveS
         raise UsageError(
             f"no live source '{asked}'; there are: virtual-cart, replay:SOURCE, gy85+webcam, serial:PORT+webcam "
             f"(an IMU of {', '.join(INERTIAL_KINDS)}; in place of webcam a camera's index or path, picam, "
-            "realsense[,depth], oak[,depth], or none: attitude by the IMU alone); realsense[,depth] and oak[,depth] "
+            "realsense[,depth], oak[,depth], or none); realsense[,depth] and oak[,depth] "
             "for such a camera with the IMU inside it"
         )
     return CartSensors(inertial, camera, config, sensors), with_clock(config)
@@ -130,11 +130,11 @@ class CartSensors:
                 )
         self._is_inside = reads_own_imu(inertial, camera)
         self.name = f"live {inertial}+{camera}"
-        self.has_camera = camera != "none"
         given, ideal = calibration_of(inertial, sensors), SensorCalibration()
         self.is_mag_calibrated = (given.mag_bias_ut, given.mag_matrix) != (ideal.mag_bias_ut, ideal.mag_matrix)
         calibration = config.calibration.camera
-        self.rig = _rig(camera, sensors, calibration, self._is_inside) if self.has_camera else NO_CAMERA
+        is_blind = camera == "none"
+        self.rig = Rig((), ()) if is_blind else _rig(camera, sensors, calibration, self._is_inside)
         self.imu_noise: ImuNoise | None = noise_of(config.calibration, sensors, rate_of(inertial, sensors))
         self.frame_count, self.problems = 0, dict[str, int]()
         self.duration_s: float | None = None
@@ -167,7 +167,7 @@ class CartSensors:
         """Return what opens the camera."""
         if self._is_inside:
             return partial(HandedFrames, self._memory, frame_config(self._camera, self._sensors).missing_s)
-        return partial(_open_frames, self._camera, self._sensors) if self.has_camera else NoCamera
+        return partial(_open_frames, self._camera, self._sensors) if self.rig.cameras else NoCamera
 
     def readings(self, setup: SensorSetup) -> Callable[[], ReadingSource]:
         """Return what reads further sensors at their ports.
@@ -224,7 +224,7 @@ def _rig(camera: str, sensors: SensorsConfig, calibration: str | None, with_imu:
     if calibration is None:
         raise UsageError(
             "a live camera needs its calibration: --calibration.camera FILE, which `vislam calibrate camera` writes; "
-            "without a camera, attitude alone: +none in its place"
+            "without a camera: +none in its place"
         )
     found = read_cameras(Path(calibration))[0]
     if found.T_body_cam is None:

@@ -37,6 +37,7 @@ from vislam.live.wire.mail import Outbox
 from vislam.live.wire.publisher import PoseReader
 from vislam.live.wire.stream import SampleReceiver, Value
 from vislam.pipeline.back import makes_depth, seen_between
+from vislam.pipeline.dark import SilentCamera
 from vislam.pipeline.front import Front
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.steps import FrontStep
@@ -46,6 +47,7 @@ from vislam.sensors import Suite
 
 _CROWDED_SPACING = 2.0  # factor on the distances between keyframes then
 _LOG = logging.getLogger(__name__)
+_LATE_NS = 300_000_000  # most that readings may come late, and be in their keyframe, where frames have no image
 _READ_S = 0.005  # most that waiting for a frame may take: samples come meanwhile
 _PUT_S = 0.1
 _SENSORS_S = 1.0  # between two words on how further sensors are
@@ -119,18 +121,16 @@ class FrontProcess:
         self._verdict = Verdict(Trust.TRUSTED)
         self._judged_t_ns = 0
         self._sensors_noted_s = 0.0
-        self._frames_taken = 0
+        self._silence = SilentCamera(rig) if rig.is_blind and suite else None  # attitude is all of an IMU alone
         self._feeds_depth = makes_depth(config, rig)
         self._poses: PoseReader | None = None
-        self._counters = {"crowded_frames": 0, "waits_for_back": 0, "back_late_ms": 0}
+        self._counters = {"frames_taken": 0, "crowded_frames": 0, "waits_for_back": 0, "back_late_ms": 0}
         self._pace, self._told_every = Pace(noise.rate_hz), 1
 
     def loop(self, camera: FrameSource, samples: SampleReceiver, readings: ReadingSource) -> None:
         """Take frames, samples and readings until the samples end."""
         while not samples.ended and not self._life.is_orphan:
-            for reading in readings.read():
-                self.front.add(reading)
-            samples.receive(self._take)
+            self._hear(samples, readings)
             self._send_readings()
             self._follow_sensors(readings)
             frame = camera.read(_READ_S)
@@ -138,8 +138,8 @@ class FrontProcess:
                 self._frames.append(frame)
             self._follow_camera(camera.health())
             self._follow_pace()
-            while self._frames and self.front.is_ready(self._frames[0].t_ns, self._frames[-1].t_ns):
-                samples.receive(self._take)
+            while self._is_next_ready:
+                self._hear(samples, readings)
                 self._process(self._frames.popleft())
 
     def end(self) -> None:
@@ -163,13 +163,33 @@ class FrontProcess:
         self._put(self._to_map, ended)
         self._to_map.close()
 
+    @property
+    def _is_next_ready(self) -> bool:
+        """Whether the oldest frame that waits can be processed."""
+        late_ns = 0 if self._silence is None else _LATE_NS
+        return bool(self._frames) and self.front.is_ready(self._frames[0].t_ns + late_ns, self._frames[-1].t_ns)
+
+    def _hear(self, samples: SampleReceiver, readings: ReadingSource) -> None:
+        """Take what came of samples and readings, each reading before the samples that are newer."""
+        values: list[Value] = []
+        samples.receive(values.append)
+        for reading in readings.read():
+            self.front.add(reading)
+        for value in values:
+            self._take(value)
+
     def _take(self, value: Value) -> None:
         if isinstance(value, Hint):
             self.front.add_hint(value)
-        else:
-            if isinstance(value, ImuSample):
-                self._pace.add_sample(value)
-            self.front.add(value)
+            return
+        self.front.add(value)
+        if not isinstance(value, ImuSample):
+            return
+        self._pace.add_sample(value)
+        if self._silence is not None:
+            self._frames += self._silence.stand_in(value.t_ns)
+            while self._is_next_ready:
+                self._process(self._frames.popleft())
 
     def _report(self) -> FrontReport:
         """Return what the front half has to say, and how it kept up."""
@@ -179,7 +199,8 @@ class FrontProcess:
     def _process(self, frame: Frame) -> None:
         begun_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
         self._see(frame)
-        self._pace.took(frame, begun_ns, time.monotonic_ns(), time.thread_time_ns() - cpu_ns)
+        if self._silence is None:  # else it is late on purpose
+            self._pace.took(frame, begun_ns, time.monotonic_ns(), time.thread_time_ns() - cpu_ns)
 
     def _see(self, frame: Frame) -> None:
         live, waiting = self._config.live, len(self._to_back)
@@ -195,9 +216,9 @@ class FrontProcess:
         self._judge(frame.t_ns)
         for odometry in step.keyframes:
             self._put_keyframe(KeyframeOut(odometry, *self._first()))
-        shows = self._config.view.enabled and self._frames_taken % self._config.view.every_frames == 0
+        shows = self._config.view.enabled and self._counters["frames_taken"] % self._config.view.every_frames == 0
         shows = shows and self._to_map.age_s < live.map_age_s
-        self._frames_taken += 1
+        self._counters["frames_taken"] += 1
         seen = Seen(light(step, shows, self._feeds_depth), self._T_map_odom(), self.front.start, self.front.learned)
         if not self._to_map.put(seen):
             raise HardwareError(
@@ -235,7 +256,7 @@ class FrontProcess:
 
     def _judge(self, t_ns: int) -> None:
         """Mark the pose as doubtful or not, and log why; nothing while the run begins."""
-        if self.front.begun.settled is None or t_ns - self._judged_t_ns < _JUDGE_NS:
+        if self.front.start is None or t_ns - self._judged_t_ns < _JUDGE_NS:
             return
         self._judged_t_ns = t_ns
         verdict = judge(front_evidence(self._report(), self._config.machine), self._config.verdict)

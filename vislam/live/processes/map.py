@@ -37,15 +37,17 @@ from vislam.runs import Progress, Run, begun
 from vislam.runs.folder import MapChoice
 from vislam.runs.session import Session, SessionWriter
 from vislam.runs.verdict import Evidence
+from vislam.sensors import Suite
 from vislam.trajectory import Trajectory
 
 _LOG = logging.getLogger(__name__)
 _WAIT_S = 0.05
+_ALONE = "there was no camera and no further sensor: attitude alone was published, and there is no trajectory"
 
 
 def run(
     life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
-    keyframes: Connection, beginning: Beginning | None, base: MapChoice | None, has_camera: bool,
+    keyframes: Connection, beginning: Beginning | None, base: MapChoice | None, suite: Suite,
     web: Connection | None = None,
 ) -> None:  # fmt: skip
     """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
@@ -61,7 +63,7 @@ def run(
         keyframes: `BackBegun` if there is a `beginning`, `KeyframeStep` from the back process, then `BackEnded`.
         beginning: the session that the run goes on from.
         base: the map among them, if it is that of another run.
-        has_camera: False where no frame can come, and none is asked for.
+        suite: further sensors; with neither these nor a camera there is no trajectory, and none is asked for.
         web: the wire of the page that shows the run; None: there is none.
     """
     rehearse_map(config, recording.rig)
@@ -72,7 +74,7 @@ def run(
     if beginning is not None:
         pipeline.wait_for_back()
     share = None if web is None else MapShare(web, out)
-    make = partial(_LiveRun, recording, config, out, pipeline, has_camera, share)
+    make = partial(_LiveRun, recording, config, out, pipeline, recording.rig.is_blind and not suite, share)
     live: Run
     if beginning is not None and beginning.is_own:
         live = resumed = make(SessionWriter.reopen(out / "session.db"))
@@ -88,14 +90,14 @@ class _LiveRun(Run):
     """A run whose steps come from other processes."""
 
     def __init__(
-        self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, has_camera: bool,
+        self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, is_alone: bool,
         share: MapShare | None, session: SessionWriter,
     ) -> None:  # fmt: skip
         super().__init__(recording, config, out, session, followed)
         self._followed, self._share = followed, share
-        self.wants_frames = has_camera
-        if not has_camera:
-            self.warnings.append("there was no camera: attitude alone was published, and there is no trajectory")
+        self.wants_frames = not is_alone
+        if is_alone:
+            self.warnings.append(_ALONE)
 
     def go_on_from(self, beginning: Beginning) -> None:
         """Go on in the run's own session, whose map is the one to be found again: the cart may stand elsewhere."""

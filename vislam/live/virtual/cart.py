@@ -47,7 +47,7 @@ class VirtualCart:
         """Choose names for what its processes share; nothing starts yet."""
         self.name = "virtual cart"
         self.rig = virtual_rig(options)
-        self.has_camera, self.is_mag_calibrated = options.rig != "none", True
+        self.is_mag_calibrated = True
         self.imu_noise: ImuNoise | None = NOISE
         self.frame_count = 0
         self.problems: dict[str, int] = {}
@@ -60,9 +60,11 @@ class VirtualCart:
 
     def settings(self, config: Config) -> Config:
         """Return the settings with what this cart knows of itself: wheels, and how high its one camera is."""
+        config = replace(config, machine=replace(config.machine, slip_sigma_m_s=USUAL_SLIP_M_S))
+        if self.rig.is_blind:
+            return config
         timeout_s = max(config.live.vision_timeout_s, _FRAMES_MISSED / self.options.camera_hz)
-        live = replace(config.live, vision_timeout_s=timeout_s)
-        config = replace(config, machine=replace(config.machine, slip_sigma_m_s=USUAL_SLIP_M_S), live=live)
+        config = replace(config, live=replace(config.live, vision_timeout_s=timeout_s))
         front = config.frontend
         if self.rig.has_depth or front.mode not in ("auto", "planar") or front.planar.height_m is not None:
             return config
@@ -87,7 +89,7 @@ class VirtualCart:
 
     def cameras(self) -> Callable[[], FrameSource]:
         """Return what opens its camera."""
-        if not self.has_camera:
+        if self.rig.is_blind:
             return NoCamera
         return partial(VirtualCamera, f"{self._shared}-camera")
 
@@ -103,7 +105,7 @@ class VirtualCart:
         found: dict[str, Callable[[Life], None]] = {
             "cart": partial(_run_cart, shared=names, command_name=self.command_name, truth=self._truth)
         }
-        if self.has_camera:
+        if not self.rig.is_blind:
             found["camera"] = partial(
                 run_camera, name=f"{self._shared}-camera", cart=names[0], epoch=self._epoch, options=self.options
             )

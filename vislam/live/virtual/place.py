@@ -22,7 +22,7 @@ _LAP = [(4.55, -2.65), (4.6, 2.6), (-0.4, 2.75), (-4.6, 2.55), (-4.55, -2.6)]
 class PlaceOptions:
     """What can be chosen about the virtual cart."""
 
-    rig: Literal["mono", "rgbd", "none"] = "mono"  # none: no camera, attitude by the IMU alone
+    rig: Literal["mono", "rgbd", "none"] = "mono"  # none: no camera
     camera_hz: Annotated[float, Field(gt=0.5, le=60.0)] = 10.0  # less where the machine cannot render as many
     image_width_px: Annotated[int, Field(ge=64, le=1280, multiple_of=4)] = 320
     camera_delay_s: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0  # that stamps are late by
@@ -34,9 +34,10 @@ class PlaceOptions:
 
 
 def virtual_rig(options: PlaceOptions) -> Rig:
-    """Return its camera: that of the world `cart-drive`, 0.6 m above the floor."""
-    kind = "mono" if options.rig == "none" else options.rig
-    return make_rig(WORLDS["cart-drive"], kind, options.image_width_px)
+    """Return its camera, if any: that of the world `cart-drive`, 0.6 m above the floor."""
+    if options.rig == "none":
+        return Rig((), ())
+    return make_rig(WORLDS["cart-drive"], options.rig, options.image_width_px)
 
 
 def make_scene(seed: int) -> Scene:

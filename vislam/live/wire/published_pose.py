@@ -74,7 +74,7 @@ class PublishedPose:
     T_map_odom: Array  # [4, 4]
     map_revision: int  # of the graph; 0: the graph has not spoken, map and odom coincide
     reset_counter: int  # one more whenever the filter gave up its certainty or was restarted
-    vision_age_s: float  # since vision corrected the filter; infinite: never, or over a minute
+    vision_age_s: float  # since vision, or without a camera a sensor, corrected; infinite: never, or over a minute
 
     @property
     def T_map_base(self) -> Array:

@@ -94,14 +94,17 @@ def _slow(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     waited = {"frames for vision": e.late_s, "for the map": e.map_late_s, "keyframes for the graph": e.graph_late_s}
     longest = ", ".join(f"{what} {late_s:.1f} s" for what, late_s in waited.items() if late_s >= _SOON_S)
     waits = f"; what waited longest: {longest}" if longest else ""
+    looked = worked = ""
+    if e.frames_offered:
+        seen = f"({e.frames_dropped} dropped, {e.frames_left_out} left out in time)"
+        looked = f"{unseen} of {e.frames_offered} frames were not looked at {seen}, "
+        worked = f"; vision worked {e.busy:.0%} of the time, with {e.core:.0%} of a core"
     others = "other work had its core, so end that first; then " if e.core < _OWN_SHARE * e.busy else ""
     samples = "; for samples, --live.realtime-priority 50" if _misses_samples(e) else ""
     yield (
-        f"the machine is too slow for its sensors: {unseen} of {e.frames_offered} frames were not looked at "
-        f"({e.frames_dropped} dropped, {e.frames_left_out} left out in time), {e.samples_missed} of "
-        f"{e.samples + e.samples_missed} inertial samples missed{mapped}{waits}; vision worked {e.busy:.0%} of the "
-        f"time, with {e.core:.0%} of a core: {others}give it less to do (--profile pi, a lower rate of the camera, "
-        f"--map.no-enabled, --view.no-enabled){samples}"
+        f"the machine is too slow for its sensors: {looked}{e.samples_missed} of {e.samples + e.samples_missed} "
+        f"inertial samples missed{mapped}{waits}{worked}: {others}give it less to do (--profile pi, a lower rate of "
+        f"the camera, --map.no-enabled, --view.no-enabled){samples}"
     )
 
 

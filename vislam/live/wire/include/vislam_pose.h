@@ -16,8 +16,8 @@
 
 enum vislam_health {
     VISLAM_LEVELLED = 1u << 0,          /* gravity is known */
-    VISLAM_VISION_OK = 1u << 1,         /* vision corrects the filter */
-    VISLAM_DEAD_RECKONING = 1u << 2,    /* no vision */
+    VISLAM_VISION_OK = 1u << 1,         /* vision, or without a camera further sensors, correct the filter */
+    VISLAM_DEAD_RECKONING = 1u << 2,    /* nothing of that */
     VISLAM_INVALID = 1u << 3,           /* do not steer by it */
     VISLAM_AT_REST = 1u << 4,
     VISLAM_MAG_OK = 1u << 5,
