@@ -55,6 +55,28 @@ def test_metric_odometry_is_accurate_and_knows_how_much(rig: str) -> None:
     assert 3.0 < np.mean(nees) < 15.0
 
 
+def test_one_cameras_directions_are_as_sure_as_parallax_allows() -> None:
+    """Soon after a keyframe noise has a say in each track's depth, and the direction leans; seeds 1 to 3."""
+    squares, soon = [], []
+    for seed in (1, 2, 3):
+        recording = open_points("handheld-room", seed=seed, rig="mono", duration_s=10.0)
+        T_body_cam = recording.rig.T_body_cams[0]
+        for _, result, T_true, T_key in driven(recording):
+            T = result.vo.T_keyframe_body
+            if T_key is None or T is None or not T[:3, 3].any():
+                continue
+            way = (invert(T_key @ T_body_cam) @ T_true @ T_body_cam)[:3, 3]
+            axes = np.linalg.svd((T_body_cam[:3, :3] @ way)[None])[2][1:].T  # across the way
+            error, to_key = axes.T @ T[:3, 3], axes.T @ T[:3, :3]
+            squares.append(error @ np.linalg.solve(to_key @ result.vo.covariance[3:, 3:] @ to_key.T, error) / 2.0)
+            soon.append(result.median_parallax_px < 10.0)
+    nees = np.array(squares)
+    print(
+        f"NEES of {len(nees)} directions {nees.mean():.1f}, of {sum(soon)} with little parallax {nees[soon].mean():.1f}"
+    )
+    assert 0.3 < nees[soon].mean() < 4.0
+
+
 @pytest.mark.parametrize("rig", ["stereo", "rgbd"])
 @pytest.mark.parametrize("pixel_sigma_px", [0.3, 1.0])
 def test_motions_are_as_sure_as_tracks_scatter(rig: str, pixel_sigma_px: float) -> None:

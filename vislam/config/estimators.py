@@ -84,7 +84,7 @@ class GraphConfig:
     gauge_sigma_rad: NonNegative = 1e-3
     covariance_ratio_max: Positive = 1e6  # eigenvalue ratio of any factor; gtsam 4.3.0 throws above 1e7
 
-    vo_inflation: Positive = 4.0  # mono, on sigma: against truth, motions err 4 to 8 times what residuals say
+    vo_inflation: Positive = 2.0  # mono, on sigma: what residuals miss, as neighbours err alike
     vo_degraded_inflation: Positive = 3.0  # further, when the front end says degraded
     vo_floor_deg: NonNegative = 0.05  # no camera and calibration is better than this between keyframes
     vo_floor_m: NonNegative = 0.001
