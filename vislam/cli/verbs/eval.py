@@ -44,8 +44,6 @@ OPTIONS = (EvalOptions,)
 
 def main(arguments: list[str]) -> int:
     """Evaluate a trajectory, those of a run folder, or its loops."""
-    from vislam.runs.folder import read_metrics
-
     options = parse(EvalOptions, arguments, "eval")
     if options.loops:
         return _eval_loops(options)
@@ -55,6 +53,8 @@ def main(arguments: list[str]) -> int:
     else:
         print_evaluation(results)
         if options.reference is None:
+            from vislam.runs.folder import read_metrics  # not before --help has answered
+
             print_truth(read_metrics(options.estimate))
     covered = min(entry["coverage"] for entry in results.values())
     if covered < options.min_coverage:
