@@ -62,10 +62,8 @@ class Doubt:
 
     def solved(self, tracks: TrackTable, selection: Selection, solution: Solution) -> int:
         """Take out views beyond the gate, and tracks with too many of them; return how many tracks."""
-        squares, which = solution.squares, selection.views.camera
         self.spreads = np.minimum(spreads(solution, selection.views), 1.0)
-        allowed = self._gate * np.column_stack((self.spreads[which], np.full(len(which), self.spreads[2]))) ** 2
-        bad: NDArray[np.bool_] = np.any(squares > allowed, axis=1)
+        bad: NDArray[np.bool_] = solution.squares.max(axis=1, initial=0.0) > self._gate
         if not bad.any():
             return 0
         first = selection.views.first
