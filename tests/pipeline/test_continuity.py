@@ -167,13 +167,16 @@ def test_orientation_from_frame_to_frame_is_the_gyroscopes(steps: list[tuple[Ste
     )  # 0.01 of it is the gyroscope's own, the rest its bias as the start knew it
 
 
-def test_the_published_pose_is_still_the_estimate(steps: list[tuple[Step, Array]]) -> None:
+def test_the_published_pose_is_still_the_estimate(
+    steps: list[tuple[Step, Array]], request: pytest.FixtureRequest
+) -> None:
     apart = [
         step_m(step.front.T_odom_body, step.front.estimate.T_odom_body)
         for step, _ in steps
         if step.front.estimate is not None and step.front.T_odom_body is not None
     ]
-    assert np.sqrt(np.mean(np.square(apart))) < 0.02
+    most_m = 0.05 if "mono, loose" in request.node.name else 0.02  # its motions lack scale
+    assert np.sqrt(np.mean(np.square(apart))) < most_m
 
 
 def turns_published(graph_sigma_rad_s: float) -> tuple[Array, Array]:
