@@ -129,10 +129,8 @@ def kitti(folder: Path, cut: int | None = None) -> Drive:
     imu = imu[measured(imu[:, 0], imu[:, 2:])]
     imu = imu[(imu[:, 0] > fixes[0, 0] - 1.0) & (imu[:, 0] < fixes[-1, 0] + 0.5)]
     start_s = np.arange(imu[0, 0], imu[0, 0] + _START_S, 0.1)
-    speeds, car_s = (
-        np.linalg.norm(CubicSpline(kept[:, 0], kept[:, 1:])(start_s, 1), axis=1),
-        np.arange(imu[0, 0], imu[-1, 0], 0.1),
-    )
+    speeds = np.linalg.norm(CubicSpline(kept[:, 0], kept[:, 1:])(start_s, 1), axis=1)
+    car_s = np.arange(imu[0, 0], imu[-1, 0], 0.1)
     true_s = (fixes[true, :1] + [-_PAIR_S, _PAIR_S]).ravel()
     return Drive(
         ImuNoise(gyro, accel, gyro_walk, accel_walk, 1.0 / period_s), imu[:, [0, 5, 6, 7, 2, 3, 4]],

@@ -209,7 +209,7 @@ class MonoFrontEnd:
             # a direction that does not settle is no reason to give up a rotation that does
             if both.converged or not still.converged:
                 parallax = _parallax(both.R_key_cam, key_xy, xy)
-                view = _without_vague_direction(_with_bias(both, self._limits.sigma_xy, parallax))
+                view = _without_vague_direction(_with_lean(both, self._limits.sigma_xy, parallax))
                 parallax_px = self._camera.fx * parallax
         agree, least = int(view.inliers.sum()), self._limits.min_inliers
         why = failure(len(self._tracker), followed, agree, view.converged, least)
@@ -339,7 +339,7 @@ def _without_vague_direction(view: TwoViewEstimate) -> TwoViewEstimate:
     return turn_only(view) if vague else view
 
 
-def _with_bias(view: TwoViewEstimate, sigma_xy: float, parallax: float) -> TwoViewEstimate:
+def _with_lean(view: TwoViewEstimate, sigma_xy: float, parallax: float) -> TwoViewEstimate:
     """Return the estimate with what its direction may be off however many tracks there are, by their parallax.
 
     Each track brings a depth of its own, so that noise does not average out (Neyman and Scott, 1948): the direction
@@ -347,9 +347,9 @@ def _with_bias(view: TwoViewEstimate, sigma_xy: float, parallax: float) -> TwoVi
     """
     if not view.converged or parallax <= 0.0:
         return view
-    bias_rad = _LEAN * view.variance * (sigma_xy / parallax) ** 2
+    lean_rad = _LEAN * view.variance * (sigma_xy / parallax) ** 2
     covariance, d = view.covariance.copy(), view.direction_key
-    covariance[3:, 3:] += bias_rad**2 * (np.eye(3) - np.outer(d, d))
+    covariance[3:, 3:] += lean_rad**2 * (np.eye(3) - np.outer(d, d))
     return replace(view, covariance=covariance)
 
 

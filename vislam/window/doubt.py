@@ -61,7 +61,7 @@ class Doubt:
         return int(bad.sum())
 
     def solved(self, tracks: TrackTable, selection: Selection, solution: Solution) -> int:
-        """Take out views beyond the gate, and tracks with too many of them; return how many tracks."""
+        """Set `spreads`; take out views beyond the gate, and tracks with too many; return how many tracks."""
         self.spreads = np.minimum(spreads(solution, selection.views), 1.0)
         bad: NDArray[np.bool_] = solution.squares.max(axis=1, initial=0.0) > self._gate
         if not bad.any():

@@ -187,13 +187,14 @@ class FrameUpdater:
         views = self._views(window, at, frame.seen[row])
         prior = features.Prior(window.P, change)
         sensor = self._point_sensor._replace(spread=float(window.spread[1]))
-        H_points, r_points, tests, good = _point_rows(
+        H_points, r_points, tests = _point_rows(
             found, window.points, views, sensor, prior, len(window.frames), self._limits
         )
+        limits = self._limits[tests[:, 1].astype(np.int64)]
+        good, gated = tests[:, 0] <= limits, tests[:, 2] > limits
         misses = window.misses + 1
         misses[found[good]] = 0
         out.count("points_used", int(good.sum()))
-        gated = tests[:, 2] > self._limits[tests[:, 1].astype(np.int64)]
         out.count("points_outliers", int((~good & ~gated).sum()))
         out.count("points_gated", int(gated.sum()))
         out.test("points", int(good.sum()), float(tests[good, 2].sum()), int(tests[good, 1].sum()))
@@ -337,17 +338,17 @@ def _point_rows(
     prior: features.Prior,
     clones: int,
     limits: Array,
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return whitened rows H [m, n] and r [m] of points of the state seen from the newest clone, and their tests.
+) -> tuple[Array, Array, Array]:
+    """Return whitened rows H [m, n] and r [m] of points of the state seen from the newest clone, and tests [K, 3].
 
-    Tests [K, 3]: NIS by the spread, degrees of freedom, 0 behind the camera, NIS as whitened. Last, which passed [K].
+    A test is NIS by the spread, degrees of freedom, NIS as whitened; infinite, 0, infinite behind the camera.
     """
     _, seen, R_cam, centres = views
     P, change = prior
     n = len(P)
     H = np.zeros((features.ROWS_MAX * len(which), n))
     r_all = np.empty(features.ROWS_MAX * len(which))
-    tests, good = np.zeros((len(which), 3)), np.zeros(len(which), dtype=np.bool_)
+    tests = np.zeros((len(which), 3))
     r = np.empty(features.ROWS_MAX)
     J = np.empty((features.ROWS_MAX, 3))
     clone = 19 + 6 * (clones - 1)
@@ -359,7 +360,7 @@ def _point_rows(
         y = R_cam[k] @ (f - centres[k])
         rows = features.observe(y, seen[k], sensor, r, J)
         if rows == 0:
-            tests[k, 2] = np.inf
+            tests[k, 0] = tests[k, 2] = np.inf
             continue
         by_point = J[:rows] @ R_cam[k]
         by_turn = by_point @ skew(f)
@@ -384,10 +385,9 @@ def _point_rows(
         tests[k, 1] = rows
         if not tests[k, 0] <= limits[rows]:
             continue
-        good[k] = True
         for i in range(rows):
             for j in range(15):
                 H[m + i, columns[j]] = h[i, j]
             r_all[m + i] = residual[i]
         m += rows
-    return H[:m], r_all[:m], tests, good
+    return H[:m], r_all[:m], tests
