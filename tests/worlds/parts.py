@@ -71,15 +71,14 @@ def with_slips(
     frames: Sequence[Observations], share: float, px_per_frame: float, rng: np.random.Generator
 ) -> list[Observations]:
     """Return what a camera saw as a tracker followed it of which a share of the corners slips, each its own way."""
-    born: dict[int, int] = {}
-    slips: dict[int, Array] = {}
+    slips: dict[int, tuple[int, Array]] = {}  # of each track, the first frame and its way per frame
     out = []
     for k, seen in enumerate(frames):
         pixels = seen.pixels_px.copy()
         for i, n in enumerate(seen.track_ids.tolist()):
-            if n not in born:
+            if n not in slips:
                 turn = rng.uniform(0.0, 2.0 * np.pi)
-                born[n], slips[n] = k, (rng.random() < share) * np.array([np.cos(turn), np.sin(turn)])
-            pixels[i] += px_per_frame * (k - born[n]) * slips[n]
+                slips[n] = k, (rng.random() < share) * px_per_frame * np.array([np.cos(turn), np.sin(turn)])
+            pixels[i] += (k - slips[n][0]) * slips[n][1]
         out.append(replace(seen, pixels_px=pixels))
     return out
