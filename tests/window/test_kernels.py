@@ -8,7 +8,20 @@ import pytest
 from vislam.config import WindowConfig
 from vislam.core.messages import Array
 from vislam.window.equations import inertial, linear, schur, visual
-from vislam.window.equations.layout import CALIBRATION, Camera, Links, Normal, States, Views, positions, retract
+from vislam.window.equations.layout import (
+    AXES,
+    CALIBRATION,
+    FOCAL,
+    METRES,
+    RIGHT,
+    Camera,
+    Links,
+    Normal,
+    States,
+    Views,
+    positions,
+    retract,
+)
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import TrackTable
 from worlds.motion import EUROC_NOISE, Motion
@@ -57,7 +70,7 @@ def make_scene(rig, seed: int) -> Scene:
         rho_information=0.01,
     )
     selection = tracks.select(np.arange(count))
-    calibration = np.array([0.008, 0.01, -0.02, 0.015, 0.012])
+    calibration = np.array([0.008, 0.01, -0.02, 0.015, 0.012, 0.02, -0.03, 0.0, 0.0, 0.0, *[0.01] * 6])
     points = np.zeros((len(selection.slots), 3))
     visual.start(np.array(X), calibration, selection.views, camera, np.ones(len(points), dtype=np.bool_), 0.2, points)
     return Scene(np.array(X), points, calibration, selection.views, camera, links.arrays)
@@ -104,7 +117,7 @@ def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
             points[1, p, i] -= step
             costs = [views_cost(scene, scene.X, q, scene.calibration) for q in points]
             assert g_points[p, i] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=1e-4, abs=1e-1)
-    for i in (0, 4):
+    for i in (0, 4, FOCAL, METRES, RIGHT, RIGHT + 1, RIGHT + 2):
         calibrations = np.repeat(scene.calibration[None], 2, axis=0)
         calibrations[0, i] += step
         calibrations[1, i] -= step
@@ -114,7 +127,7 @@ def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
 
 def test_gradient_by_extrinsic_rotation() -> None:
     scene = make_scene(STEREO, 3)
-    scene = scene._replace(calibration=np.array([0.008, 0.0, 0.0, 0.0, 0.012]))  # where its tangent is its difference
+    scene.calibration[1:4] = 0.0  # where its tangent is its difference
     g, _ = normal_equations(scene)
     for i in range(1, 4):
         costs = []
@@ -133,7 +146,7 @@ def test_gradient_of_links_is_that_of_their_cost() -> None:
     where = positions(count, True)
     held = np.zeros(count, dtype=np.bool_)
     states = States(scene.X, scene.X, held)
-    inertial.linearise(states, scene.links, GRAVITY_M_S2, where, count - 1, count, Normal(A, g))
+    inertial.linearise(states, scene.calibration, scene.links, GRAVITY_M_S2, where, count - 1, count, Normal(A, g))
     for k in range(count):
         for i in range(15):
             step = 1e-6
@@ -142,8 +155,15 @@ def test_gradient_of_links_is_that_of_their_cost() -> None:
                 X, d = scene.X.copy(), np.zeros(15)
                 d[i] = sign * step
                 retract(X[k], d)
-                costs.append(inertial.cost(X, scene.links, GRAVITY_M_S2))
+                costs.append(inertial.cost(X, scene.calibration, scene.links, GRAVITY_M_S2))
             assert g[where[k, i]] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=2e-3, abs=10.0), (k, i)
+    for i in range(AXES, CALIBRATION):
+        costs = []
+        for sign in (1e-6, -1e-6):
+            c = scene.calibration.copy()
+            c[i] += sign
+            costs.append(inertial.cost(scene.X, c, scene.links, GRAVITY_M_S2))
+        assert g[-CALIBRATION + i] == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-3, abs=10.0), i
 
 
 def test_factorisation_solution_and_covariance_agree_with_numpy() -> None:
@@ -179,7 +199,7 @@ def test_landmarks_are_found_at_their_depth() -> None:
         rate=np.zeros((len(X), 3)), applied_offset_s=np.zeros(len(X)), T_cam0_cams=scene.camera.T_cam0_cams
     )
     points = np.zeros((len(selection.slots), 3))
-    visual.start(X, np.zeros(5), selection.views, camera, np.ones(len(points), dtype=np.bool_), 0.2, points)
+    visual.start(X, np.zeros(CALIBRATION), selection.views, camera, np.ones(len(points), dtype=np.bool_), 0.2, points)
     squares = np.zeros((len(selection.rows), 2))
-    visual.cost(X, points, np.zeros(5), selection.views, camera, squares)
+    visual.cost(X, points, np.zeros(CALIBRATION), selection.views, camera, squares)
     assert np.sqrt(squares[:, 0]).max() < 0.02  # standard deviations of 1 px, so px

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from vislam.config import WindowConfig
-from vislam.core.camera import Rig
+from vislam.core.camera import EXACT, CameraSigmas, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert, se3_log
 from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
@@ -37,6 +37,28 @@ def position_rmse(updates: list[WindowUpdate], truths: list[tuple[Array, Array, 
 
 def path_m(truths: list[tuple[Array, Array, Array]]) -> float:
     return float(sum(np.linalg.norm(b[0][:3, 3] - a[0][:3, 3]) for a, b in pairwise(truths)))
+
+
+def with_errors(rig: Rig, focal: float, metres: float) -> Rig:
+    """Return what a calibration says of a rig that has `1 + focal` and `1 + metres` times its lengths."""
+    cameras = tuple(replace(c, fx=c.fx / (1.0 + focal), fy=c.fy / (1.0 + focal)) for c in rig.cameras)
+    poses = list(rig.T_body_cams)
+    if rig.is_stereo:
+        apart = rig.T_cam0_cam1.copy()
+        apart[:3, 3] /= 1.0 + metres
+        poses[1] = poses[0] @ apart
+    return replace(rig, cameras=cameras, T_body_cams=tuple(poses))
+
+
+def as_measured(packet: KeyframePacket, axes: Array, depth: float) -> KeyframePacket:
+    """Return a packet by an IMU whose axes show `1 + axes` [6] times the truth, and with such depths."""
+    imu, seen = packet.imu, packet.observations
+    if imu is not None:
+        gyro, accel = imu.gyro_rad_s * (1.0 + axes[:3]), imu.accel_m_s2 * (1.0 + axes[3:])
+        imu = replace(imu, gyro_rad_s=gyro, accel_m_s2=accel)
+    if seen.depth_m is not None:
+        seen = replace(seen, depth_m=seen.depth_m / (1.0 + depth))
+    return replace(packet, imu=imu, observations=seen)
 
 
 @pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
@@ -106,7 +128,7 @@ def test_time_offset_and_extrinsic_rotation_are_found() -> None:
     updates, _, _ = run(world)
     found = updates[-1].calibration
     assert abs(found.time_offset_s - 0.03) < 0.002
-    assert abs(found.time_offset_s - 0.03) < 5.0 * found.time_offset_sigma_s + 2e-4
+    assert abs(found.time_offset_s - 0.03) < 5.0 * found.sigmas[0] + 2e-4
     assert np.abs(found.R_cam_correction - correction).max() < np.deg2rad(0.1)
 
 
@@ -114,8 +136,36 @@ def test_calibration_that_is_switched_off_stays() -> None:
     config = replace(HONEST, estimate_time_offset=False, estimate_rotation=False)
     updates, _, _ = run(World(Motion.random(3), MONO, 3, duration_s=3.0), config)
     found = updates[-1].calibration
-    assert found.time_offset_s == 0.0 and found.time_offset_sigma_s == 0.0
+    assert found.time_offset_s == 0.0 and found.sigmas[0] == 0.0
     assert not found.R_cam_correction.any() and not found.R_cam_sigma.any()
+
+
+@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
+def test_errors_of_lens_metres_and_axes_are_states(rig: Rig) -> None:
+    noise = replace(EUROC_NOISE, gyroscope_scale_sigma=0.005, accelerometer_scale_sigma=0.01)
+    sigmas, squares, estimated, ignored = CameraSigmas(0.01, 0.01, 0.002), list[Array](), list[float](), list[float]()
+    for seed in range(1, 5):
+        packets, truths = World(Motion.random(seed, 1.2), rig, seed, duration_s=12.0).packets()
+        rng = np.random.default_rng(seed)
+        focal, metres = 0.01 * rng.normal(size=2)
+        axes = np.repeat([0.005, 0.01], 3) * rng.normal(size=6)
+        given = with_errors(rig, focal, metres)
+        measured = [as_measured(p, axes, metres if rig.has_depth else 0.0) for p in packets]
+        for believed, imu, errors_m in ((sigmas, noise, estimated), (EXACT, EUROC_NOISE, ignored)):
+            cameras = tuple(replace(camera, sigmas=believed) for camera in given.cameras)
+            window = SlidingWindow(HONEST, replace(given, cameras=cameras), imu, MACHINE)
+            window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(seed)))
+            updates = [window.add(p) for p in measured]
+            errors_m.append(position_rmse(updates, truths))
+            if believed is sigmas:
+                found, truth = updates[-1].calibration, np.concatenate([[focal, metres], np.zeros(3), axes])
+                known = found.sigmas[5:] > 0.0
+                squares.append(((found.values[5:] - truth)[known] / found.sigmas[5:][known]) ** 2)
+                assert found.sigmas[5] < 0.3 * sigmas.focal
+                assert (rig is MONO) == (found.metres_sigma == 0.0)
+    print(f"position errors {np.round(estimated, 3)} m, ignored {np.round(ignored, 3)} m, {np.mean(squares, axis=0)}")
+    assert sum(estimated) < 0.7 * sum(ignored)
+    assert 0.3 < np.mean(squares) < 2.0
 
 
 def test_known_rolling_shutter_is_accounted_for() -> None:

@@ -14,7 +14,7 @@ from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravit
 from worlds.lap import World
 
 Array = NDArray[np.float64]
-_EXACT = CalibrationEstimate(0.0, 0.0, np.zeros(3), np.zeros(3), 0.0, 0.0)
+_EXACT = CalibrationEstimate(np.zeros(16), np.zeros(16))
 
 
 class FakeWindow:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import EXACT, Camera, Rig
 from vislam.core.geometry import invert, skew, so3_exp, transform
 from vislam.core.messages import Array, KeyframePacket, NavState, Observations, Tracking, VoMeasurement
 from vislam.core.readings import Motion as Told
@@ -15,7 +15,7 @@ from vislam.imu.series import ImuSeries
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion
 from worlds.parts import R_BODY_CAM, bare_keyframe, on_walls
 
-PINHOLE = Camera(640, 480, 460.0, 460.0, 320.0, 240.0)
+PINHOLE = Camera(640, 480, 460.0, 460.0, 320.0, 240.0, sigmas=EXACT)
 T_BODY_CAM0 = transform(R_BODY_CAM, np.array([0.05, 0.05, 0.02]))
 T_BODY_CAM1 = transform(R_BODY_CAM, np.array([0.05, -0.06, 0.02]))
 MONO = Rig((PINHOLE,), (T_BODY_CAM0,))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from vislam.core.camera import Camera, Distortion
+from vislam.core.camera import Camera, CameraSigmas, Distortion
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
@@ -37,6 +37,7 @@ MODEL_NAMES: dict[Distortion, str] = {
 NOISE_KEYS = (  # of Kalibr, and the names in `ImuNoise`
     "gyroscope_noise_density", "accelerometer_noise_density", "gyroscope_random_walk", "accelerometer_random_walk",
 )  # fmt: skip
+SIGMA_KEYS = {"focal": "focal_sigma", "metres": "metres_sigma", "turn_rad": "turn_sigma_rad"}  # ours, of a camera
 SCALE_KEYS = ("gyroscope_scale_sigma", "accelerometer_scale_sigma")  # ours
 CAMERA_EXAMPLE = (
     "T_BS: {rows: 4, cols: 4, data: [16 numbers]}, resolution: [640, 480], intrinsics: [fx, fy, cx, cy], "
@@ -176,8 +177,10 @@ def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> 
         )
     coefficients = numbers_in(data, coefficients_key, path) if model != "none" else []
     skew = numbers_in({"skew_px": [data.get("skew_px", 0.0)]}, "skew_px", path, 1)[0]
+    stated = {key: optional_positive(data, name, path, allow_zero=True) for key, name in SIGMA_KEYS.items()}
+    sigmas = CameraSigmas(**{key: value for key, value in stated.items() if value is not None})
     try:
-        return Camera(int(width), int(height), fx, fy, cx, cy, skew, model, tuple(coefficients))
+        return Camera(int(width), int(height), fx, fy, cx, cy, skew, model, tuple(coefficients), sigmas)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 
@@ -235,6 +238,7 @@ def camera_text(camera: Camera, T_body_cam: Array | None, comment: str) -> str:
         f"skew_px: {float(camera.skew_px)!r}\n"
         f"distortion_model: {MODEL_NAMES[camera.distortion]}\n"
         f"distortion_coefficients: {list_text(camera.coefficients)}\n"
+        + "".join(f"{name}: {float(getattr(camera.sigmas, key))!r}\n" for key, name in SIGMA_KEYS.items())
     )
 
 

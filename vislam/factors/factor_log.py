@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import Camera, CameraSigmas, Rig
 from vislam.core.messages import Array, KeyframePacket, LoopEdge, NavState
 from vislam.imu import ImuNoise
 from vislam.trajectory.frames import LoggedFrames
@@ -57,7 +57,12 @@ def rig_data(rig: Rig) -> dict[str, Any]:
 
 def rig_from(data: dict[str, Any]) -> Rig:
     """Return the rig of plain data; raises KeyError, TypeError or ValueError on what is none."""
-    cameras = [Camera(**{**entry, "coefficients": tuple(entry["coefficients"])}) for entry in data["cameras"]]
+    cameras = [
+        Camera(
+            **{**entry, "coefficients": tuple(entry["coefficients"]), "sigmas": CameraSigmas(**entry.get("sigmas", {}))}
+        )
+        for entry in data["cameras"]
+    ]
     poses = tuple(np.array(T, dtype=np.float64).reshape(4, 4) for T in data["T_body_cams"])
     return Rig(tuple(cameras), poses, bool(data["has_depth"]))
 

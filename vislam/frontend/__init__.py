@@ -53,7 +53,7 @@ def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
 
 def common_errors(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
     """Return what motions of the front end of `mode_for` have in common; `noise` is the IMU's, None without one."""
-    return FRONT_ENDS[mode_for(config, rig)].errors(config, noise)
+    return FRONT_ENDS[mode_for(config, rig)].errors(config, rig, noise)
 
 
 def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:

@@ -264,9 +264,9 @@ class MetricFrontEnd:
         return self._tracks.exposures.learned(self._tracks.tracker.next_id, self._usual.depth.every_frame)
 
     @classmethod
-    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
-        """Return none: covariances have them."""
-        return CommonErrors()
+    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
+        """Return that of the baseline or of the unit of depth; covariances have the others."""
+        return CommonErrors(rig.metres_sigma)
 
 
 class StereoFrontEnd(MetricFrontEnd):

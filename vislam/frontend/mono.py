@@ -160,7 +160,7 @@ class MonoFrontEnd:
         return replace(self._report(frame, motion), outliers=outliers)
 
     @classmethod
-    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
+    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
         """Return that of the accelerometer's scale, by which all metres come."""
         return CommonErrors(0.0 if noise is None else noise.accelerometer_scale_sigma or 0.0)
 

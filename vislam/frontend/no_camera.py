@@ -29,7 +29,7 @@ class NoFrontEnd:
         self._keyframe_id = -1
 
     @classmethod
-    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
+    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
         """Return that there are no motions to err."""
         return CommonErrors()
 

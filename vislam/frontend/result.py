@@ -57,8 +57,8 @@ class FrontEnd(Protocol):
         ...
 
     @classmethod
-    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
-        """Return what motions have in common; `noise` is the IMU's, None without one."""
+    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
+        """Return what motions seen by a rig have in common; `noise` is the IMU's, None without one."""
         ...
 
     def track(

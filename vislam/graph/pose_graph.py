@@ -226,7 +226,7 @@ class PoseGraph:
         knows metres better than a floor or a baseline, and would tie all factors to one; considered, it costs nothing.
         """
         states = [self._source.state(one.id, one.t_ns, self._estimator) for one in self._keyframes]
-        return [_stretched(state, self._estimator.poses[0], self._config.scale_sigma) for state in states]
+        return [_stretched(state, self._estimator.poses[0], self._source.scale_sigma) for state in states]
 
     def own(self, name: str) -> tuple[Array, Array] | None:
         """Return a sensor's own variables [V], in their order, and their sigmas [V], NaN where gtsam gives none.

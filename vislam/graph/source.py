@@ -53,6 +53,10 @@ class Source(Protocol):
     def details(self) -> dict[str, Any]:
         """Return what is worth telling about the last keyframe."""
 
+    @property
+    def scale_sigma(self) -> float:
+        """Return the relative error that all metres may have in common, beyond what its factors know of."""
+
     def begin(self, start: StartRecord, state: NavState | None) -> None:
         """Take the first state."""
 
@@ -93,6 +97,7 @@ class MotionSource:
     def __init__(self, config: GraphConfig, noise: ImuNoise | None, machine: MachineConfig, lever_m: Array) -> None:
         """Start empty."""
         self._odometry = MotionOdometry(Builder(config, noise, machine, lever_m))
+        self.scale_sigma = config.scale_sigma  # see Source
         self._newest_id = -1
 
     @property
@@ -184,6 +189,7 @@ class WindowSource:
         self._by_surfaces: dict[int, tuple[Array, Array]] = {}  # motions of keyframes whose edges are not settled yet
         self._by_depth: dict[int, tuple[Array, Array]] = {}  # motions to keyframes that no track ties to the one before
         self._details: dict[str, Any] = {}
+        self.scale_sigma = config.scale_sigma  # see Source; as the window knows it, once it has an IMU to learn it by
 
     @property
     def odometry(self) -> Odometry:
@@ -220,6 +226,7 @@ class WindowSource:
         self._local.append(update.newest)
         if update.newest is not None:
             self._fresh[record.id] = update.newest
+            self.scale_sigma = update.calibration.metres_sigma
         for k, state in update.states:
             self._local[k] = self._fresh[k] = state
         self._details = {

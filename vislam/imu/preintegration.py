@@ -38,6 +38,9 @@ class Preintegrated:
     dv_daccel: Array  # [3, 3]
     dp_dgyro: Array  # [3, 3]
     dp_daccel: Array  # [3, 3]
+    by_axes: (
+        Array  # [9, 6] of rotation, velocity, position by relative errors of the axes of gyroscope and accelerometer
+    )
     covariance: Array  # [9, 9]; zero without a noise model
     gyro_bias_rad_s: Array  # [3], the biases that were taken off
     accel_bias_m_s2: Array  # [3]
@@ -80,7 +83,7 @@ def preintegrate(
             noise.gyroscope_noise_density * span.noise.gyro,
             noise.accelerometer_noise_density * span.noise.accel,
         )
-    dR, dv, dp, J_gyro, J_accel, covariance = _integrate(
+    dR, dv, dp, J, by_axes, covariance = _integrate(
         span.t_ns, span.gyro_rad_s, span.accel_m_s2, gyro_bias, accel_bias, *densities
     )
     return Preintegrated(
@@ -88,11 +91,12 @@ def preintegrate(
         dR=dR,
         dv_m_s=dv,
         dp_m=dp,
-        dR_dgyro=J_gyro[:3],
-        dv_dgyro=J_gyro[3:6],
-        dv_daccel=J_accel[3:6],
-        dp_dgyro=J_gyro[6:],
-        dp_daccel=J_accel[6:],
+        dR_dgyro=J[:3, :3],
+        dv_dgyro=J[3:6, :3],
+        dv_daccel=J[3:6, 3:],
+        dp_dgyro=J[6:, :3],
+        dp_daccel=J[6:, 3:],
+        by_axes=by_axes,
         covariance=covariance,
         gyro_bias_rad_s=gyro_bias.copy(),
         accel_bias_m_s2=accel_bias.copy(),
@@ -119,10 +123,11 @@ def _integrate(
     accel_density: float,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     dR, dv, dp = np.eye(3), np.zeros(3), np.zeros(3)
-    J_gyro, J_accel = np.zeros((9, 3)), np.zeros((9, 3))  # of (rotation, velocity, position) by bias
+    by_biases, by_axes = np.zeros((9, 6)), np.zeros((9, 6))  # of (rotation, velocity, position)
     covariance = np.zeros((9, 9))
     F = np.eye(9)
-    G_gyro, G_accel = np.zeros((9, 3)), np.zeros((9, 3))
+    G = np.zeros((9, 6))
+    variance = np.array([gyro_density**2] * 3 + [accel_density**2] * 3)
     for k in range(len(t_ns) - 1):
         dt = (t_ns[k + 1] - t_ns[k]) * 1e-9
         rate = 0.5 * (gyro[k] + gyro[k + 1]) - gyro_bias
@@ -130,23 +135,21 @@ def _integrate(
         half = so3_exp(0.5 * dt * rate)
         R_middle = dR @ half
         acceleration = R_middle @ force
-        # One step in error form: e' = F e - G_gyro n_gyro - G_accel n_accel, the same for noise and for bias.
+        # One step in error form: e' = F e - G n, the same for noise and for bias; an error of scale is a bias that goes
+        # with what is measured.
         F[:3, :3] = so3_exp(-dt * rate)
         F[3:6, :3] = -dt * (dR @ skew(half @ force))
         F[6:, :3] = 0.5 * dt * F[3:6, :3]
         for i in range(3):
             F[6 + i, 3 + i] = dt
-        G_gyro[:3] = dt * so3_right_jacobian(dt * rate)
-        G_gyro[3:6] = (-0.5 * dt * dt) * (R_middle @ skew(force) @ so3_right_jacobian(0.5 * dt * rate))
-        G_gyro[6:] = 0.5 * dt * G_gyro[3:6]
-        G_accel[3:6] = dt * R_middle
-        G_accel[6:] = 0.5 * dt * G_accel[3:6]
-        J_gyro = F @ J_gyro - G_gyro
-        J_accel = F @ J_accel - G_accel
-        covariance = F @ covariance @ F.T
-        covariance += (gyro_density * gyro_density / dt) * (G_gyro @ G_gyro.T)
-        covariance += (accel_density * accel_density / dt) * (G_accel @ G_accel.T)
+        G[:3, :3] = dt * so3_right_jacobian(dt * rate)
+        G[3:6, :3] = (-0.5 * dt * dt) * (R_middle @ skew(force) @ so3_right_jacobian(0.5 * dt * rate))
+        G[3:6, 3:] = dt * R_middle
+        G[6:] = 0.5 * dt * G[3:6]
+        by_biases, by_axes = F @ by_biases - G, F @ by_axes
+        by_axes -= G * np.concatenate((rate, force))
+        covariance = F @ covariance @ F.T + (G * (variance / dt)) @ G.T
         dp = dp + dt * dv + (0.5 * dt * dt) * acceleration
         dv = dv + dt * acceleration
         dR = dR @ (half @ half)
-    return dR, dv, dp, J_gyro, J_accel, 0.5 * (covariance + covariance.T)
+    return dR, dv, dp, by_biases, by_axes, 0.5 * (covariance + covariance.T)

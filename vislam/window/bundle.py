@@ -18,6 +18,7 @@ from vislam.core.camera import Rig
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, Observations
 from vislam.imu import ImuNoise, Preintegrated
+from vislam.window.calibration import Calibration
 from vislam.window.doubt import spreads
 from vislam.window.equations import (
     CALIBRATION,
@@ -35,7 +36,7 @@ from vislam.window.equations import (
     visual,
 )
 from vislam.window.posterior import GAUGE_SIGMA_M, GAUGE_SIGMA_RAD, pose, scale_sigma
-from vislam.window.spans import information, jacobian_by_bias
+from vislam.window.spans import information, jacobian_by_imu
 from vislam.window.tracks import RHO_START, TrackTable
 
 _ROUGH, _TOLERANCE = 1e-4, 1e-6  # relative decrease of the cost; the first until the pixels' noise is known
@@ -93,9 +94,9 @@ def solve(
 ) -> BundleSolution:
     """Optimise poses, velocities, biases, landmarks and the time offset of a few frames to convergence.
 
-    The extrinsic rotation is held. Position and yaw of frame 0 are fixed to the gauge's sigmas of `config`. After a
-    first convergence the noise of the pixels is measured, in place of `config.sigma_px`, and what does not fit is
-    left out.
+    The extrinsic rotation of the first camera is held; errors of focal length, baseline and the IMU's axes are states.
+    Position and yaw of frame 0 are fixed to the gauge's sigmas of `config`. After a first convergence the noise of the
+    pixels is measured, in place of `config.sigma_px`, and what does not fit is left out.
 
     Raises:
         ValueError: fewer than two frames, or lists whose lengths do not fit.
@@ -112,10 +113,11 @@ def solve(
         tracks.add(k, seen)
     selection = tracks.select(ids)
     total = max(len(selection.rows), 1)
-    camera = _camera(problem, config, rig)
+    sigmas = _calibration_sigmas(problem, config, rig, noise)
+    camera = _camera(problem, config, rig, sigmas > 0.0)
     X, calibration = _states(problem), np.zeros(CALIBRATION)
     held = np.zeros(count, dtype=np.bool_)
-    links, gauge, room = _links(problem, noise), _gauge(problem), Room()
+    links, gauge, room = _links(problem, noise), _gauge(problem, sigmas), Room()
     sigma, whitening, iterations = 1.0, 1.0, 0
     for tolerance in (_ROUGH, _ROUGH, _TOLERANCE):
         views = _whitened_by(selection.views, whitening)
@@ -133,10 +135,10 @@ def solve(
             break
         X, calibration = solution.X.copy(), solution.calibration
         errors = np.sqrt(solution.squares[:, 0]) * whitening
-        sigmas = spreads(solution, selection.views) * whitening
-        sigma = float(sigmas[0])
+        scatter = spreads(solution, selection.views) * whitening
+        sigma = float(scatter[0])
         whitening = sigma * problem.inflation
-        tracks.remove_rows(selection.rows[errors > _OUTLIER * sigmas[selection.views.camera]])
+        tracks.remove_rows(selection.rows[errors > _OUTLIER * scatter[selection.views.camera]])
         selection = tracks.select(ids)
     return replace(
         _solution(problem, solution, links, gravity_m_s2),
@@ -147,10 +149,15 @@ def solve(
     )
 
 
-def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig) -> Camera:
+def _calibration_sigmas(problem: BundleProblem, config: WindowConfig, rig: Rig, noise: ImuNoise) -> Array:
+    """Return the sigmas [16] of what is estimated of the calibration, 0 for what is held."""
+    sigmas = Calibration(config, rig, noise, 0.0).start_sigmas
+    sigmas[:5] = 0.0 if problem.rate_rad_s is None else problem.time_offset_sigma_s, 0.0, 0.0, 0.0, 0.0
+    return sigmas
+
+
+def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig, active: NDArray[np.bool_]) -> Camera:
     count = len(problem.T_world_body)
-    active = np.zeros(CALIBRATION, dtype=np.bool_)
-    active[0] = problem.time_offset_sigma_s > 0.0 and problem.rate_rad_s is not None
     return Camera(
         T_body_cam=rig.T_body_cams[0],
         T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]]),
@@ -185,12 +192,12 @@ def _rescale(X: Array, links: Links, lever_m: Array, accel_bias_sigma_m_s2: floa
             J, at = np.zeros((6, 12)), np.r_[0:6, 6 + 3 * k : 12 + 3 * k]  # scale, tilt, bias, velocities
             J[3:, 0] = turn @ (shape[k + 1] - shape[k])
             J[:3, 1:3], J[3:, 1:3] = turn @ by_tilt * -dt, turn @ by_tilt * (-0.5 * dt * dt)
-            J[:, 3:6] = -links.by_bias[k, 3:, 3:]
+            J[:, 3:6] = -links.by_imu[k, 3:, 3:6]
             J[:3, 6:9], J[:3, 9:12], J[3:, 6:9] = -turn, turn, -turn * dt
             known = np.concatenate([
                 links.dv[k] + turn @ down * dt,
                 links.dp[k] + turn @ (down * (0.5 * dt * dt) + levers[k + 1] - levers[k]),
-            ]) - links.by_bias[k, 3:, 3:] @ links.bias[k, 3:]  # fmt: skip
+            ]) - links.by_imu[k, 3:, 3:6] @ links.bias[k, 3:]  # fmt: skip
             weighted = J.T @ walked[k]
             H[np.ix_(at, at)] += weighted @ J
             b[at] += weighted @ known
@@ -234,7 +241,7 @@ def _solution(problem: BundleProblem, solution: Solution, links: Links, gravity_
         reprojection_px=float(np.sqrt(np.median(solution.squares[:, 0]))) if views > 0 else float("nan"),
         sigma_px=float("nan"),
         outliers=float("nan"),
-        inertial_ratio=2.0 * inertial.cost(solution.X, links, gravity_m_s2) / (9.0 * (count - 1)),
+        inertial_ratio=2.0 * inertial.cost(solution.X, solution.calibration, links, gravity_m_s2) / (9.0 * (count - 1)),
         views=views,
         iterations=solution.iterations,
         converged=solution.ok,
@@ -261,7 +268,7 @@ def _links(problem: BundleProblem, noise: ImuNoise) -> Links:
         dR=np.array([s.dR for s in spans]),
         dv=np.array([s.dv_m_s for s in spans]),
         dp=np.array([s.dp_m for s in spans]),
-        by_bias=np.array([jacobian_by_bias(s) for s in spans]),
+        by_imu=np.array([jacobian_by_imu(s) for s in spans]),
         information=np.array([information(s) for s in spans]),
         bias=np.array([np.concatenate([s.gyro_bias_rad_s, s.accel_bias_m_s2]) for s in spans]),
         walk_information=1.0 / (np.maximum(walk, 1e-9) ** 2 * dt[:, None]),
@@ -276,12 +283,12 @@ def _links(problem: BundleProblem, noise: ImuNoise) -> Links:
     )
 
 
-def _gauge(problem: BundleProblem) -> Prior:
+def _gauge(problem: BundleProblem, sigmas: Array) -> Prior:
     """Return the prior on frame 0: position and yaw fixed, biases loosely, tilt and velocity free."""
     up = problem.T_world_body[0, 2, :3]
     H = np.zeros((CALIBRATION + 15, CALIBRATION + 15))
-    if problem.time_offset_sigma_s > 0.0:
-        H[0, 0] = problem.time_offset_sigma_s**-2
+    known = np.flatnonzero(sigmas)
+    H[known, known] = sigmas[known] ** -2
     state = H[CALIBRATION:, CALIBRATION:]
     state[:3, :3] = np.outer(up, up) / GAUGE_SIGMA_RAD**2 + 1e-2 * np.eye(3)  # 10 rad: only keeps it solvable
     state[3:6, 3:6] = np.eye(3) / GAUGE_SIGMA_M**2

@@ -38,8 +38,8 @@ class Doubt:
     ) -> int:
         """Take out what the newest keyframe saw and nobody expected; return of how many tracks.
 
-        `covariance` [6 M + 5, 6 M + 5] is that of all poses, the newest a prediction, and of the calibration. If hardly
-        anything is as expected, again and again, it is the expectation that is wrong, and all of it stays.
+        `covariance` [6 M + 16, 6 M + 16] is that of all poses, the newest a prediction, and of the calibration. If
+        hardly anything is as expected, again and again, it is the expectation that is wrong, and all of it stays.
         """
         rows = tracks.continued(keyframes.ids)
         if len(rows) == 0:

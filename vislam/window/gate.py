@@ -17,8 +17,10 @@ from vislam.window.equations import (
     ERROR,
     POINT,
     SEEN,
+    VIEWED,
     Camera,
     Hosted,
+    Lens,
     Links,
     Measured,
     Mount,
@@ -29,7 +31,7 @@ from vislam.window.equations import (
     hosted,
     inertial,
     invert,
-    lens,
+    lenses,
     linearised,
     measured,
     mounted,
@@ -44,13 +46,14 @@ _DEPTH_STEPS = 4
 _DEPTH_IS_TAKEN = 1e12  # m^2, information on an inverse depth that is fixed
 
 
-def predicted_covariance(known: Array, X: Array, links: Links, gravity_m_s2: float) -> Array | None:
-    """Return the covariance [6 M + 5, 6 M + 5] of all poses and the calibration, the last pose being a prediction.
+def predicted_covariance(known: Array, X: Array, calibration: Array, links: Links, gravity_m_s2: float) -> Array | None:
+    """Return the covariance [6 M + 16, 6 M + 16] of all poses and the calibration, the last pose being a prediction.
 
     Args:
-        known: [9 + 6 (M - 1) + 5] before the last keyframe: velocity and biases of the one before it, poses,
+        known: [9 + 6 (M - 1) + 16] before the last keyframe: velocity and biases of the one before it, poses,
             calibration.
         X: states [M, 21].
+        calibration: [16].
         links: [M - 1] of which the last one predicts.
         gravity_m_s2: of the link.
 
@@ -58,17 +61,18 @@ def predicted_covariance(known: Array, X: Array, links: Links, gravity_m_s2: flo
         None where the link does not tell enough.
     """
     last = Links(*(a[-2:] if name == "rest_weight" else a[-1:] for name, a in links._asdict().items()))
-    A, where = np.zeros((30, 30)), np.arange(30).reshape(2, 15)
+    size = 30 + CALIBRATION
+    A, where = np.zeros((size, size)), np.arange(30).reshape(2, 15)
     states = States(X[-2:], X[-2:], np.zeros(2, dtype=np.bool_))
-    inertial.linearise(states, last, gravity_m_s2, where, 1, 0, Normal(A, np.zeros(30)))
+    inertial.linearise(states, calibration, last, gravity_m_s2, where, 1, 0, Normal(A, np.zeros(size)))
     A = A + np.triu(A, 1).T
     try:
-        noise = np.linalg.inv(A[15:, 15:])
+        noise = np.linalg.inv(A[15:30, 15:30])
     except np.linalg.LinAlgError:
         return None
-    forward = -(noise @ A[15:, :15])[:6]  # of the new pose by the last state
+    forward = -(noise @ np.hstack([A[15:30, :15], A[15:30, 30:]]))[:6]  # of the new pose by last state and calibration
     poses = len(known) - 9 - CALIBRATION
-    state = np.concatenate([9 + poses - 6 + np.arange(6), np.arange(9)])
+    state = np.concatenate([9 + poses - 6 + np.arange(6), np.arange(9), 9 + poses + np.arange(CALIBRATION)])
     old = np.arange(9, len(known))
     out = np.zeros((poses + 6 + CALIBRATION,) * 2)
     kept = np.concatenate([np.arange(poses), poses + 6 + np.arange(CALIBRATION)])
@@ -92,10 +96,10 @@ def innovations(
     Args:
         X: states [M, 21], the last one a prediction.
         points: bearing and inverse depth [L, 3] by the older views.
-        calibration: [5].
+        calibration: [16].
         views: of landmarks that an older keyframe hosts.
         camera: geometry and timing.
-        covariance: [6 M + 5, 6 M + 5] of poses and calibration.
+        covariance: [6 M + 16, 6 M + 16] of poses and calibration.
         squares: [N] gets the squared innovations, chi-square with two degrees of freedom; infinite behind the camera,
             NaN for older views.
     """
@@ -104,8 +108,8 @@ def innovations(
     own_block, inverse, cross = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, width))
     scratch = np.empty((2, 2, width))
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
-    active, huber_k = camera.active, camera.huber_k
+    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    huber_k = camera.huber_k
     squares[:] = np.nan
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
@@ -114,20 +118,20 @@ def innovations(
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
         landmark = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
         for n in range(first[p], first[p + 1]):  # in order of time: the newest ones come last
-            k, view, cam = keyframes[n], measured(values, n), lens(cams, cameras[n])
+            k, view, cam = keyframes[n], measured(values, n), cams[cameras[n]]
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
             if k != newest:
                 seen = sight(landmark, at, mount, cam)
-                ahead, error = residual(seen.in_cam, rho, view)
+                ahead, error = residual(seen.in_cam, rho, view, cam)
                 if ahead:
-                    linearised(landmark, seen, view, active, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
+                    linearised(landmark, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
                     _add_older(J, view.depth_weight > 0.0, host, k, len(X), own_block, cross)
                 continue
             squares[n] = np.inf
             if not invert(own_block, 0.0, inverse):
                 continue
             rho_information = 1.0 / inverse[2, 2]
-            best = _best_depth(landmark, rho_information, mount, at, cam, view, active, J)
+            best = _best_depth(landmark, rho_information, mount, at, cam, view, J)
             if not np.isfinite(best):
                 continue
             squares[n] = _square(J, host, k, len(X), own_block, cross, covariance, scratch)
@@ -165,18 +169,17 @@ def _square(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_depth(
-    landmark: Hosted, rho_information: float, mount: Mount, at: Place, cam: Mount, view: Measured, active: Array,
-    J: Array,
+    landmark: Hosted, rho_information: float, mount: Mount, at: Place, cam: Lens, view: Measured, J: Array,
 ) -> float:  # fmt: skip
     """Return the inverse depth that explains a view best, and J of it; NaN if none is in front of the camera."""
     rho = min(max(landmark.rho, 0.0), _MAX_RHO)
     for step in range(_DEPTH_STEPS + 1):
         trial = hosted(landmark.place, mount, landmark.row, landmark.bearing[0], landmark.bearing[1], rho)
         seen = sight(trial, at, mount, cam)
-        ahead, error = residual(seen.in_cam, rho, view)
+        ahead, error = residual(seen.in_cam, rho, view, cam)
         if not ahead:
             return np.nan
-        linearised(trial, seen, view, active, False, error, (np.inf, np.inf), J)
+        linearised(trial, seen, view, False, error, (np.inf, np.inf), J)
         if step < _DEPTH_STEPS:
             slope = J[0, POINT + 2] * error[0] + J[1, POINT + 2] * error[1] + rho_information * (rho - landmark.rho)
             curvature = J[0, POINT + 2] * J[0, POINT + 2] + J[1, POINT + 2] * J[1, POINT + 2] + rho_information
@@ -186,13 +189,12 @@ def _best_depth(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_older(J: Array, deep: bool, host: int, seen: int, count: int, own_block: Array, cross: Array) -> None:
-    """Add an older view to what is known of a landmark [3, 3] and how that depends on poses [3, 6 M + 5]."""
+    """Add an older view to what is known of a landmark [3, 3] and how that depends on poses [3, 6 M + 16]."""
     for k in range(3 if deep else 2):
         for i in range(3):
             for j in range(3):
                 own_block[i, j] += J[k, POINT + i] * J[k, POINT + j]
-            if seen != host:
-                _scatter(J, k, host, seen, count, J[k, POINT + i], cross[i])
+            _scatter(J, k, host, seen, count, J[k, POINT + i], cross[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -201,7 +203,7 @@ def _scatter(J: Array, k: int, host: int, seen: int, count: int, factor: float, 
     for i in range(6):
         out[6 * host + i] += factor * J[k, i]
         out[6 * seen + i] += factor * J[k, SEEN + i]
-    for i in range(CALIBRATION):
+    for i in range(VIEWED):
         out[6 * count + i] += factor * J[k, CALIBRATED + i]
 
 

@@ -36,14 +36,37 @@ class WindowGravity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEstimate:
-    """What the window believes about the sensor's calibration; a quantity that is not estimated has sigma 0."""
+    """What the window believes about the calibration of cameras and IMU; what is not estimated has sigma 0.
 
-    time_offset_s: float  # to add to the camera's own stamps to get the IMU's time: applied so far plus residual
-    time_offset_sigma_s: float
-    R_cam_correction: Array  # [3] rotation vector in cam0 axes, rad: R_body_cam0 = given @ so3_exp(correction)
-    R_cam_sigma: Array  # [3] rad
-    readout_s: float  # rolling shutter, first to last row
-    readout_sigma_s: float
+    In their order: what is to be added to the camera's stamps to get the IMU's time, applied so far plus residual [s];
+    rotation of cam0, a vector in its axes with R_body_cam0 = given @ so3_exp(vector) [3, rad]; readout of a rolling
+    shutter, first to last row [s]; relative errors: the true focal length and the true baseline (or depth) are
+    1 + error times what was given; rotation of cam1, as that of cam0, in cam0 [3, rad]; relative errors of the axes of
+    gyroscope and accelerometer, which show 1 + error times the truth [6].
+    """
+
+    values: Array  # [16]
+    sigmas: Array  # [16]
+
+    @property
+    def time_offset_s(self) -> float:
+        """To add to the camera's own stamps to get the IMU's time."""
+        return float(self.values[0])
+
+    @property
+    def R_cam_correction(self) -> Array:
+        """Rotation vector [3] in cam0 axes, rad."""
+        return self.values[1:4]
+
+    @property
+    def R_cam_sigma(self) -> Array:
+        """Sigmas [3] of that, rad."""
+        return self.sigmas[1:4]
+
+    @property
+    def metres_sigma(self) -> float:
+        """How well the baseline or the unit of depth is known, relative; 0 where neither measures or is in doubt."""
+        return float(self.sigmas[6])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

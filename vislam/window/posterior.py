@@ -20,7 +20,7 @@ _NO_MOTION_M = 1e-3
 class Posterior:
     """Covariance of what is eliminated last: velocity and biases of the newest keyframe, all poses, calibration."""
 
-    covariance: Array  # [9 + 6 M + 5] in both directions; without the first 9 where there are poses alone
+    covariance: Array  # [9 + 6 M + 16] in both directions; without the first 9 where there are poses alone
     count: int  # of keyframes, M
     others: int  # 9, or 0
 
@@ -37,7 +37,7 @@ class Posterior:
 
     @property
     def calibration(self) -> Array:
-        """Return the covariance [5, 5] of the calibration."""
+        """Return the covariance [16, 16] of the calibration."""
         at = self.others + 6 * self.count
         return self.covariance[at:, at:]
 

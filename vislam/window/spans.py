@@ -40,7 +40,7 @@ class LinkStore:
             dR=np.tile(np.eye(3), (size, 1, 1)),
             dv=np.zeros((size, 3)),
             dp=np.zeros((size, 3)),
-            by_bias=np.zeros((size, 9, 6)),
+            by_imu=np.zeros((size, 9, 12)),
             information=np.zeros((size, 9, 9)),
             bias=np.zeros((size, 6)),
             walk_information=np.zeros((size, 6)),
@@ -117,7 +117,7 @@ class LinkStore:
         result = preintegrate(span, bias[:3], bias[3:], self._noise)
         links = self._links
         links.dR[k], links.dv[k], links.dp[k], links.bias[k] = result.dR, result.dv_m_s, result.dp_m, bias
-        links.by_bias[k] = jacobian_by_bias(result)
+        links.by_imu[k] = jacobian_by_imu(result)
         links.information[k] = information(result, self._outage(span, result.dt_s))
 
     def refresh(self, biases: Array) -> None:
@@ -197,12 +197,13 @@ def _is_near(X: Array, told_at: Array) -> bool:
     return bool(changed[:, :9].max() < _HEAR_AGAIN_RAD and apart.max() < _HEAR_AGAIN_M)
 
 
-def jacobian_by_bias(span: Preintegrated) -> Array:
-    """Return d(rotation, velocity, position) by gyro and accel bias [9, 6]."""
-    out = np.zeros((9, 6))
+def jacobian_by_imu(span: Preintegrated) -> Array:
+    """Return d(rotation, velocity, position) by gyro and accel bias and by errors of their axes [9, 12]."""
+    out = np.zeros((9, 12))
     out[_ROTATION, :3] = span.dR_dgyro
-    out[_VELOCITY, :3], out[_VELOCITY, 3:] = span.dv_dgyro, span.dv_daccel
-    out[_POSITION, :3], out[_POSITION, 3:] = span.dp_dgyro, span.dp_daccel
+    out[_VELOCITY, :3], out[_VELOCITY, 3:6] = span.dv_dgyro, span.dv_daccel
+    out[_POSITION, :3], out[_POSITION, 3:6] = span.dp_dgyro, span.dp_daccel
+    out[:, 6:] = span.by_axes
     return out
 
 

@@ -14,7 +14,7 @@ from vislam.core.messages import Array, Observations
 from vislam.window.equations import Ints, Views
 
 RHO_START = 0.2  # 1/m: 5 m, where nothing is known
-_VALUES = 9  # of a view, see Views
+_VALUES = 11  # of a view, see Views
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +167,7 @@ def check_observations(seen: Observations, where: str) -> None:
 
 
 def _whitened(camera: Camera, pixels_px: Array, sigma_px: float, at_once: bool = False) -> Array:
-    """Return rows [N, 9] of the table without depth; NaN where no ray gives the pixel.
+    """Return rows [N, 11] of the table without depth; NaN where no ray gives the pixel.
 
     `at_once` says that all rows of the image count as seen at the frame's own time.
     """
@@ -176,6 +176,7 @@ def _whitened(camera: Camera, pixels_px: Array, sigma_px: float, at_once: bool =
     out[:, :2] = xy
     rays = np.column_stack([xy, np.ones(len(xy))])
     out[:, 2:6] = camera.project_jacobian(rays)[:, :, :2].reshape(-1, 4) / sigma_px
+    out[:, 9:11] = (pixels_px - (camera.cx, camera.cy)) / sigma_px
     if not at_once:
         out[:, 6] = pixels_px[:, 1] / camera.height - 0.5
     return out

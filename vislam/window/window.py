@@ -36,7 +36,7 @@ from vislam.window.equations import (
 from vislam.window.incoming import Start, check_packet
 from vislam.window.keyframes import Keyframes
 from vislam.window.leaving import broken_off, settled, split
-from vislam.window.messages import CalibrationEstimate, WindowEdge, WindowGravity, WindowUpdate
+from vislam.window.messages import WindowEdge, WindowGravity, WindowUpdate
 from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma
 from vislam.window.spans import LinkStore
 from vislam.window.tracks import RHO_START, Selection, TrackTable
@@ -62,7 +62,7 @@ class SlidingWindow:
             )
         self._config = config
         self._rig = rig
-        self._has_imu = noise is not None
+        self._noise = noise
         self._measures_scale = rig.is_stereo or rig.has_depth
         self._T_cam0_cams = np.array([invert(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]])
         self._links = LinkStore(config, noise, machine)
@@ -78,7 +78,7 @@ class SlidingWindow:
             DataError: it is not finite, or its covariance is not positive semidefinite.
             UsageError: an IMU without a state.
         """
-        self._start = Start.of(state, T_local_body, self._has_imu)
+        self._start = Start.of(state, T_local_body, self._noise is not None)
         self._clear()
 
     def add(
@@ -113,7 +113,7 @@ class SlidingWindow:
     def _clear(self) -> None:
         self._full = self._start is not None and self._start.state is not None  # with velocities and biases
         self._keyframes = Keyframes()
-        self._calibration = Calibration(self._config, self._full, 0.0)
+        self._calibration = self._new_calibration(0.0)
         self._doubt = Doubt()
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
@@ -122,6 +122,9 @@ class SlidingWindow:
         self._speed_sigma_m_s = 0.0
         self._last_edges: list[WindowEdge] = []
         self._sure = self._at_rest = False
+
+    def _new_calibration(self, time_offset_s: float) -> Calibration:
+        return Calibration(self._config, self._rig, self._noise if self._full else None, time_offset_s)
 
     # ---- what comes in
 
@@ -139,7 +142,7 @@ class SlidingWindow:
     def _first_state(self, packet: KeyframePacket) -> Array:
         """Return the state of the first keyframe, and set the prior on it."""
         assert self._start is not None
-        self._calibration = Calibration(self._config, self._full, packet.time_offset_s)
+        self._calibration = self._new_calibration(packet.time_offset_s)
         x, self._prior = self._start.equations(self._calibration)
         if self._start.state is not None:
             self._speed_sigma_m_s = float(np.sqrt(np.diag(self._start.state.covariance)[6:9].max()))
@@ -183,7 +186,9 @@ class SlidingWindow:
         links, keyframes = self._links.arrays, self._keyframes
         if self._known is None or not self._sure or self._at_rest or not links.inertial[-1]:
             return 0
-        covariance = gate.predicted_covariance(self._known, keyframes.X, links, self._links.gravity_m_s2)
+        covariance = gate.predicted_covariance(
+            self._known, keyframes.X, self._calibration.values, links, self._links.gravity_m_s2
+        )
         if covariance is None:
             return 0
         return self._doubt.newest(self._tracks, keyframes, covariance, self._calibration.values, self._camera())
@@ -279,7 +284,6 @@ class SlidingWindow:
 
     def _restart(self, packet: KeyframePacket) -> WindowUpdate:
         """Begin again at the newest keyframe, as the last good solution predicts it, and let all others go."""
-        config = self._config
         state, final = broken_off(self._keyframes, self._last_edges)
         newest = state if self._full else None
         self.initialise(newest, state.T_world_body)
@@ -291,9 +295,7 @@ class SlidingWindow:
             odometry=final,
             tilts=(),
             states=(),
-            calibration=CalibrationEstimate(
-                packet.time_offset_s, config.time_offset_sigma_s, np.zeros(3), np.zeros(3), config.readout_s or 0.0, 0.0
-            ),
+            calibration=self._calibration.estimate(None, packet.time_offset_s),
             scale_sigma=self._scale_sigma,
             rejected_tracks=0,
             note=f"the window restarted at keyframe {packet.keyframe.id}: its equations had no solution",

@@ -74,7 +74,7 @@ class PlanarFrontEnd:
         self._R_key: Array = np.eye(3)  # level frame from cam0, in the keyframe
 
     @classmethod
-    def errors(cls, config: FrontEndConfig, noise: ImuNoise | None) -> CommonErrors:
+    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
         """Return that of the camera's height, by which all metres come, and the inflation over a floor."""
         floor = config.planar
         return CommonErrors(

@@ -16,7 +16,7 @@ from itertools import chain, takewhile
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vislam.core.camera import Rig
+from vislam.core.camera import CameraSigmas, Rig
 from vislam.core.errors import UsageError
 from vislam.core.messages import Frame, ImuSample
 from vislam.core.recording import Problems, Recording, WrappedRecording
@@ -163,7 +163,9 @@ def _turned(rig: Rig, deg: float) -> Rig:
 
 
 def _focal(rig: Rig, factor: float) -> Rig:
-    cameras = tuple(replace(camera, fx=camera.fx * factor, fy=camera.fy * factor) for camera in rig.cameras)
+    cameras = tuple(
+        replace(camera, fx=camera.fx * factor, fy=camera.fy * factor, sigmas=CameraSigmas()) for camera in rig.cameras
+    )
     return Rig(cameras, rig.T_body_cams, rig.has_depth)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import EXACT, Camera, Rig
 from vislam.core.messages import Array
 from vislam.sim.motion.path import Travel, rounded_path, smoothstep, wander
 from vislam.sim.motion.spline import BodySpline
@@ -197,11 +197,11 @@ def vi_sensor_rig() -> Rig:
     """Return the stereo rig of EuRoC's VI-Sensor (Burri et al., IJRR 2016): 752x480, 80 degrees wide, 11 cm apart."""
     left = Camera(
         width=752, height=480, fx=458.654, fy=457.296, cx=367.215, cy=248.375, distortion="radtan",
-        coefficients=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+        coefficients=(-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05), sigmas=EXACT,
     )  # fmt: skip
     right = Camera(
         width=752, height=480, fx=457.587, fy=456.134, cx=379.999, cy=255.238, distortion="radtan",
-        coefficients=(-0.28368365, 0.07451284, -0.00010473, -3.55590700e-05),
+        coefficients=(-0.28368365, 0.07451284, -0.00010473, -3.55590700e-05), sigmas=EXACT,
     )  # fmt: skip
     T_body_left = np.array(
         [

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import EXACT, Camera, Rig
 from vislam.core.messages import Array
 from vislam.imu import ImuNoise
 from vislam.sim.motion.spline import BodySpline
@@ -83,7 +83,7 @@ def camera(width_px: int) -> Camera:
     """Return the simulated camera at a width: 4:3, 70 degrees wide, mild radial-tangential distortion."""
     full = Camera(
         width=640, height=480, fx=456.4, fy=455.7, cx=322.1, cy=237.6, distortion="radtan",
-        coefficients=(-0.081, 0.042, 0.0006, -0.0004),
+        coefficients=(-0.081, 0.042, 0.0006, -0.0004), sigmas=EXACT,
     )  # fmt: skip
     return full.scaled(width_px / full.width)
 

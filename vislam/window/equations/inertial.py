@@ -12,20 +12,28 @@ from vislam.core.geometry import skew, so3_exp, so3_log, so3_right_jacobian, so3
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.core.small import product, product_back, product_transposed, put, put_back, rotated_back
-from vislam.window.equations.layout import CALIBRATION, Ints, Links, Normal, States, difference, rotation
+from vislam.window.equations.layout import (
+    AXES,
+    CALIBRATION,
+    Ints,
+    Links,
+    Normal,
+    States,
+    difference,
+    rotation,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def imu_error(a: Array, b: Array, links: Links, k: int, gravity_m_s2: float, J: Array) -> Array:
-    """Return the error [9] (rotation, velocity, position) between states [21], and its derivative in J [9, 30].
+def imu_error(a: Array, b: Array, calibration: Array, links: Links, k: int, gravity_m_s2: float, J: Array) -> Array:
+    """Return the error [9] (rotation, velocity, position) between states [21], and its derivative in J [9, 36].
 
-    Columns of J: error of state a [15], then of state b.
+    Columns of J: error of state a [15], of state b, relative errors of the axes [6].
     """
-    Ra, Rb, by_bias, dt = rotation(a), rotation(b), links.by_bias[k], links.dt[k]
-    moved = np.zeros(9)
+    Ra, Rb, by_imu, dt, moved = rotation(a), rotation(b), links.by_imu[k], links.dt[k], np.zeros(9)
     for i in range(9):
         for j in range(6):
-            moved[i] += by_bias[i, j] * (a[15 + j] - links.bias[k, j])
+            moved[i] += by_imu[i, j] * (a[15 + j] - links.bias[k, j]) + by_imu[i, 6 + j] * calibration[AXES + j]
     turn, velocity, position = moved[:3], np.empty(3), np.empty(3)
     for i in range(3):
         velocity[i] = b[12 + i] - a[12 + i]
@@ -40,11 +48,12 @@ def imu_error(a: Array, b: Array, links: Links, k: int, gravity_m_s2: float, J: 
         out[3 + i] = v[i] - (links.dv[k, i] + moved[3 + i])
         out[6 + i] = p[i] - (links.dp[k, i] + moved[6 + i])
     inverse = so3_right_jacobian_inverse(error)
-    back = product_back(so3_exp(error), product(so3_right_jacobian(turn), by_bias))  # its first rows and columns
+    turned = product(inverse, product_back(so3_exp(error), so3_right_jacobian(turn)))
     J[:] = 0.0
     put(J, 0, 0, -1.0, product_transposed(inverse, Rab))
     put(J, 0, 15, 1.0, inverse)
-    put(J, 0, 9, -1.0, product(inverse, back))
+    put(J, 0, 9, -1.0, product(turned, by_imu))  # its first rows and columns
+    put(J, 0, 30, -1.0, product(turned, by_imu[:, 6:]))
     put(J, 3, 0, 1.0, skew(v))
     put(J, 6, 0, 1.0, skew(p))
     put_back(J, 3, 6, -1.0, Ra)
@@ -54,7 +63,7 @@ def imu_error(a: Array, b: Array, links: Links, k: int, gravity_m_s2: float, J: 
     put_back(J, 6, 18, 1.0, Ra)
     for i in range(3, 9):
         for j in range(6):
-            J[i, 9 + j] = -by_bias[i, j]
+            J[i, 9 + j], J[i, 30 + j] = -by_imu[i, j], -by_imu[i, 6 + j]
     return out
 
 
@@ -117,13 +126,10 @@ def _add_told(d: Array, links: Links, where: Ints, k: int, A: Array, g: Array) -
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scatter(J: Array, information: Array, r: Array, where: Ints, k: int, A: Array, g: Array) -> None:
-    """Add an error r [n] of keyframes k and k + 1 to the normal equations; `information` [n, n] is symmetric."""
+def _scatter(J: Array, information: Array, r: Array, at: Ints, A: Array, g: Array) -> None:
+    """Add an error r [n] of the unknowns `at` to the normal equations; `information` [n, n] is symmetric."""
     rows, width = J.shape
-    half = width // 2
-    weighted, at, row = np.zeros((rows, width)), np.empty(width, dtype=np.int64), np.empty(width)
-    for i in range(width):
-        at[i] = where[k + i // half, i % half]
+    weighted, row = np.zeros((rows, width)), np.empty(width)
     for m in range(rows):
         for n in range(rows):
             factor = information[m, n]
@@ -152,16 +158,16 @@ def _diagonal(at_a: int, at_b: int, weight: float, error: float, A: Array, g: Ar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
+def cost(X: Array, calibration: Array, links: Links, gravity_m_s2: float) -> float:
     """Return half the squared error of all links and of rest."""
-    J9, J6 = np.empty((9, 30)), np.empty((6, 12))
+    J9, J6 = np.empty((9, 36)), np.empty((6, 12))
     total = 0.0
     for k in range(len(X)):
         for i in range(12, 15):
             total += (links.rest_weight[k] * X[k, i]) ** 2
     for k in range(len(X) - 1):
         if links.inertial[k]:
-            r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, J9)
+            r = imu_error(X[k], X[k + 1], calibration, links, k, gravity_m_s2, J9)
             for i in range(9):
                 for j in range(9):
                     total += r[i] * links.information[k, i, j] * r[j]
@@ -178,26 +184,36 @@ def cost(X: Array, links: Links, gravity_m_s2: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def linearise(
-    states: States, links: Links, gravity_m_s2: float, where: Ints, count: int, rests: int, normal: Normal
+    states: States,
+    calibration: Array,
+    links: Links,
+    gravity_m_s2: float,
+    where: Ints,
+    count: int,
+    rests: int,
+    normal: Normal,
 ) -> None:
     """Add the first `count` links and rest of the first `rests` keyframes to the normal equations.
 
-    `where` [M, 15] (or [M, 6]) says at which unknown each
-    keyframe's error lies; with six there are no velocities.
+    `where` [M, 15] (or [M, 6]) says at which unknown each keyframe's error lies; with six there are no velocities. The
+    calibration [16] comes after them.
     """
     X, X_first, held = states
     A, g = normal
-    J9, J6, weights = np.empty((9, 30)), np.empty((6, 12)), np.zeros((6, 6))
+    J9, J6, weights = np.empty((9, 36)), np.empty((6, 12)), np.zeros((6, 6))
     full = where.shape[1] == 15
+    at = np.empty(36, dtype=np.int64)
+    at[30:] = where.size + AXES + np.arange(6)
     for k in range(count):
         a = X_first[k] if held[k] else X[k]
         b = X_first[k + 1] if held[k + 1] else X[k + 1]
         if full:
             if links.inertial[k]:
-                r = imu_error(X[k], X[k + 1], links, k, gravity_m_s2, J9)
+                r = imu_error(X[k], X[k + 1], calibration, links, k, gravity_m_s2, J9)
                 if held[k] or held[k + 1]:
-                    imu_error(a, b, links, k, gravity_m_s2, J9)
-                _scatter(J9, links.information[k], r, where, k, A, g)
+                    imu_error(a, b, calibration, links, k, gravity_m_s2, J9)
+                at[:15], at[15:30] = where[k], where[k + 1]
+                _scatter(J9, links.information[k], r, at, A, g)
             for i in range(6, 15):  # velocity, biases
                 weight = links.velocity_weight[k] ** 2 if i < 9 else links.walk_information[k, i - 9]
                 _diagonal(where[k, i], where[k + 1, i], weight, X[k + 1, 6 + i] - X[k, 6 + i], A, g)
@@ -207,7 +223,8 @@ def linearise(
                 guess_error(a, b, links.guess[k], J6)
             for i in range(6):
                 weights[i, i] = links.guess_weight[k, i // 3] ** 2
-            _scatter(J6, weights, r, where, k, A, g)
+            at[:6], at[6:12] = where[k, :6], where[k + 1, :6]
+            _scatter(J6, weights, r, at[:12], A, g)
         if links.told[k]:
             _add_told(_told_shift(X[k], X[k + 1], links.told_at[k]), links, where, k, A, g)
     if full:
@@ -220,7 +237,7 @@ def linearise(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def prior_shift(X: Array, X_first: Array, calibration: Array, calibration_first: Array, held: int, size: int) -> Array:
-    """Return how far [5 + held * size] the states are from where the prior was linearised."""
+    """Return how far [16 + held * size] the states are from where the prior was linearised."""
     out = np.empty(CALIBRATION + held * size)
     for i in range(CALIBRATION):
         out[i] = calibration[i] - calibration_first[i]

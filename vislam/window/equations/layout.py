@@ -19,7 +19,10 @@ from vislam.core.messages import Array
 from vislam.core.small import product, product_back
 
 STATE = 21
-CALIBRATION = 5  # time offset, rotation of the camera (3), readout
+# Time offset, rotation of the camera (3), readout; relative errors of the focal length and of what measures metres (the
+# baseline or the depth image), rotation of the right camera (3); relative errors of the axes of gyroscope (3) and
+# accelerometer (3)
+CALIBRATION, FOCAL, METRES, RIGHT, AXES = 16, 5, 6, 7, 10
 Ints = NDArray[np.int64]
 
 
@@ -45,8 +48,9 @@ class Views(NamedTuple):
     host: Ints  # [L] keyframe whose camera 0 holds bearing and inverse depth
     keyframe: Ints  # [N]
     camera: Ints  # [N] 0 or 1
-    values: Array  # [N, 9] x and y on z = 1; [2, 2] that turns an error there into standard deviations; row of the
-    # image, -0.5 at the top to 0.5; 1/z that was measured, 1/m, and 1 / its sigma, 0 where it was not
+    values: Array  # [N, 11] x and y on z = 1; [2, 2] that turns an error there into standard deviations; row of the
+    # image, -0.5 at the top to 0.5; 1/z that was measured, 1/m, and 1 / its sigma, 0 where it was not; pixel from the
+    # principal point in standard deviations
 
 
 class Links(NamedTuple):
@@ -57,7 +61,7 @@ class Links(NamedTuple):
     dR: Array  # [., 3, 3]
     dv: Array  # [., 3]
     dp: Array  # [., 3]
-    by_bias: Array  # [., 9, 6] rotation, velocity, position by gyro bias and accel bias
+    by_imu: Array  # [., 9, 12] rotation, velocity, position by the biases and the errors of the axes, gyroscope first
     information: Array  # [., 9, 9]
     bias: Array  # [., 6] that was taken off
     walk_information: Array  # [., 6]
@@ -78,7 +82,7 @@ class Camera(NamedTuple):
     T_cam0_cams: Array  # [C, 4, 4]
     rate: Array  # [M, 3] of the body at each keyframe, rad/s
     applied_offset_s: Array  # [M] time offset that is already in the stamp
-    active: NDArray[np.bool_]  # [5] what is estimated
+    active: NDArray[np.bool_]  # [16] what is estimated
     huber_k: Array  # [3] of a pixel's error in either camera, and of a depth's, whitened
     rho_information: float  # of the prior of inverse depth
 
@@ -86,9 +90,9 @@ class Camera(NamedTuple):
 class Prior(NamedTuple):
     """Cost `b @ dx + dx @ H @ dx / 2` of calibration and the first keyframes, around where they were linearised."""
 
-    H: Array  # [5 + n * S, 5 + n * S], S = 15, or 6 without an IMU
+    H: Array  # [16 + n * S, 10 + n * S], S = 15, or 6 without an IMU
     b: Array
-    calibration: Array  # [5]
+    calibration: Array  # [16]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

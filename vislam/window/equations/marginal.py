@@ -47,7 +47,7 @@ def marginalise(
     full: bool,
     room: Room,
 ) -> Prior:
-    """Return the prior [5 + (M - 1) * S] on calibration and the keyframes after the first.
+    """Return the prior [16 + (M - 1) * S] on calibration and the keyframes after the first.
 
     The old prior speaks of states around `X_first` [M, 21]. All are linearised at `X_linear` [M, 21]: those that a
     marginal prior holds where they were, the others at X or near it. The new prior speaks of states around there. The
@@ -64,10 +64,11 @@ def marginalise(
     add_prior(prior, dx, prior_positions(count, held_count, full), A, g)
     everywhere = np.ones(count, dtype=np.bool_)
     states, normal = States(X, X_linear, everywhere), Normal(A, g)
-    inertial.linearise(states, links, gravity_m_s2, where, min(1, count - 1), 1, normal)
+    inertial.linearise(states, calibration, links, gravity_m_s2, where, min(1, count - 1), 1, normal)
     visual.linearise(states, leaving.points, calibration, leaving.views, camera, poses_at, normal, landmarks)
     schur.eliminate(landmarks, 0.0, poses_at, A, g)
     gone, kept = where[0], np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
+    A[:, D - CALIBRATION + np.flatnonzero(~camera.active)] = 0.0
     told = np.flatnonzero(np.diag(A)[kept])  # of the others nothing is said: their rows and columns are zero
     rows = np.concatenate([gone, kept[told]])
     A = A[np.ix_(rows, rows)]

@@ -15,11 +15,12 @@ from vislam.core.geometry import so3_exp
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.core.small import Mat, Vec, back, by, cross, dot, in_a_row, minus, plus, product, times, turned
-from vislam.window.equations.layout import CALIBRATION, Camera
+from vislam.window.equations.layout import FOCAL, METRES, RIGHT, Camera
 
 # Columns of a row of the derivative: by the host's pose, calibration and landmark, the error itself, by the pose that
 # sees. What belongs to a landmark comes first and together; the rest of the width is empty.
-CALIBRATED, POINT, ERROR, SEEN, COLUMNS = 6, 11, 14, 16, 24
+VIEWED = 10  # entries of the calibration that a view depends on, the first ones
+CALIBRATED, POINT, ERROR, SEEN, COLUMNS = 6, 16, 19, 20, 26
 _MIN_Z = 0.02  # relative to the host's depth: nearer is beside or behind the camera
 
 
@@ -35,13 +36,25 @@ class Measured(NamedTuple):
     row: float
     inverse_depth: float
     depth_weight: float
+    off_x: float  # from the principal point, standard deviations
+    off_y: float
 
 
 class Mount(NamedTuple):
-    """Camera 0 on the body, or another camera in camera 0."""
+    """Camera 0 on the body."""
 
     R: Mat
     p: Vec
+
+
+class Lens(NamedTuple):
+    """A camera in camera 0, and how it images."""
+
+    R: Mat
+    p: Vec  # as calibrated
+    metres: float  # by which p and measured depths are as calibrated
+    focal: float
+    is_right: bool
 
 
 class Place(NamedTuple):
@@ -73,7 +86,7 @@ class Sight(NamedTuple):
     gap: Vec  # from this body to the host, world axes
     in_seen: Vec  # body axes
     in_cam0: Vec
-    cam: Mount
+    cam: Lens
     in_cam: Vec
 
 
@@ -82,7 +95,7 @@ def measured(values: Array, n: int) -> Measured:
     """Return view n."""
     return Measured(
         values[n, 0], values[n, 1], values[n, 2], values[n, 3], values[n, 4], values[n, 5], values[n, 6], values[n, 7],
-        values[n, 8],
+        values[n, 8], values[n, 9], values[n, 10],
     )  # fmt: skip
 
 
@@ -94,9 +107,14 @@ def mounted(camera: Camera, calibration: Array) -> Mount:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lens(T: Array, c: int) -> Mount:
-    """Return camera c in camera 0, of T_cam0_cams [C, 4, 4]."""
-    return Mount(in_a_row(T[c]), (T[c, 0, 3], T[c, 1, 3], T[c, 2, 3]))
+def lenses(T: Array, calibration: Array) -> tuple[Lens, Lens]:
+    """Return the cameras in camera 0, of T_cam0_cams [C, 4, 4]; of one camera twice the same."""
+    metres, focal, last = 1.0 + calibration[METRES], 1.0 + calibration[FOCAL], T[-1]
+    turned = product(last, so3_exp(calibration[RIGHT : RIGHT + 3]))
+    return (
+        Lens(in_a_row(T[0]), (T[0, 0, 3], T[0, 1, 3], T[0, 2, 3]), metres, focal, False),
+        Lens(in_a_row(turned), (last[0, 3], last[1, 3], last[2, 3]), metres, focal, True),
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -124,23 +142,25 @@ def hosted(at: Place, mount: Mount, row: float, a: float, b: float, rho: float) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sight(landmark: Hosted, at: Place, mount: Mount, cam: Mount) -> Sight:
+def sight(landmark: Hosted, at: Place, mount: Mount, cam: Lens) -> Sight:
     """Carry a landmark into a camera of a body at a place."""
     rho, gap = landmark.rho, minus(landmark.place.p, at.p)
     in_seen = back(at.R, plus(landmark.in_world, times(rho, gap)))
     in_cam0 = back(mount.R, minus(in_seen, times(rho, mount.p)))
-    return Sight(at, mount, gap, in_seen, in_cam0, cam, back(cam.R, minus(in_cam0, times(rho, cam.p))))
+    return Sight(at, mount, gap, in_seen, in_cam0, cam, back(cam.R, minus(in_cam0, times(rho * cam.metres, cam.p))))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def residual(in_cam: Vec, rho: float, view: Measured) -> tuple[bool, Vec]:
+def residual(in_cam: Vec, rho: float, view: Measured, cam: Lens) -> tuple[bool, Vec]:
     """Return whether a landmark is in front of the camera, and the view's whitened error: pixel and inverse depth."""
     x, y, z = in_cam
     if not z > _MIN_Z:
         return False, (0.0, 0.0, 0.0)
-    ex, ey = x / z - view.x, y / z - view.y
-    depth = view.depth_weight * (rho / z - view.inverse_depth)
-    return True, (view.white_xx * ex + view.white_xy * ey, view.white_yx * ex + view.white_yy * ey, depth)
+    ex, ey, focal = x / z - view.x, y / z - view.y, cam.focal
+    depth = view.depth_weight * (cam.metres * rho / z - view.inverse_depth)
+    white_x = focal * (view.white_xx * ex + view.white_xy * ey + view.off_x) - view.off_x
+    white_y = focal * (view.white_yx * ex + view.white_yy * ey + view.off_y) - view.off_y
+    return True, (white_x, white_y, depth)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -163,7 +183,6 @@ def linearised(
     landmark: Hosted,
     seen: Sight,
     view: Measured,
-    active: Array,
     same: bool,
     error: Vec,
     huber_k: tuple[float, float],
@@ -177,26 +196,31 @@ def linearised(
     z = seen.in_cam[2]
     x, y = seen.in_cam[0] / z, seen.in_cam[1] / z
     weight = np.sqrt(robust(error[0] * error[0] + error[1] * error[1], huber_k[0])[0])
-    a, b = weight * view.white_xx / z, weight * view.white_xy / z
+    cam = seen.cam
+    slope = weight * cam.focal
+    a, b, off = slope * view.white_xx, slope * view.white_xy, weight * view.off_x
     for k in range(3):  # in a loop, for numba would compile the row again for each constant
         if k == 1:
-            a, b = weight * view.white_yx / z, weight * view.white_yy / z
-        by_cam = (a, b, -(a * x + b * y))
-        slope = 0.0
+            a, b, off = slope * view.white_yx, slope * view.white_yy, weight * view.off_y
+        by_cam = (a / z, b / z, -(a * x + b * y) / z)
+        by_lens = ((weight * error[k] + off) / cam.focal, 0.0)
         if k == 2:
             if not view.depth_weight > 0.0:
                 break
             weight = np.sqrt(robust(error[2] * error[2], huber_k[1])[0])
-            slope = weight * view.depth_weight / z
+            slope = weight * view.depth_weight * cam.metres / z
             by_cam = (0.0, 0.0, -slope * landmark.rho / z)
-        _row(landmark, seen, view.row, active, same, by_cam, J, k)
+            by_lens = (0.0, slope * landmark.rho / cam.metres)
+        _row(landmark, seen, view.row, same, by_cam, by_lens, J, k)
         if k == 2:
             J[k, POINT + 2] += slope
         J[k, ERROR] = weight * error[k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _row(landmark: Hosted, seen: Sight, row: float, active: Array, same: bool, by_cam: Vec, J: Array, k: int) -> None:
+def _row(
+    landmark: Hosted, seen: Sight, row: float, same: bool, by_cam: Vec, by_lens: tuple[float, float], J: Array, k: int
+) -> None:
     """Carry the derivative by the camera's coordinates back through the frames into row k of J [3, 24].
 
     The whole way depends on rho, for the landmark is scaled by it.
@@ -209,10 +233,14 @@ def _row(landmark: Hosted, seen: Sight, row: float, active: Array, same: bool, b
     by_bearing = back(mount.R, by_host)
     J[k, POINT], J[k, POINT + 1] = by_bearing[0], by_bearing[1]
     J[k, POINT + 2] = (
-        dot(minus(by_host, by_seen), mount.p) + dot(by_world, seen.gap) - dot(by_cam0, seen.cam.p)
+        dot(minus(by_host, by_seen), mount.p) + dot(by_world, seen.gap) - seen.cam.metres * dot(by_cam0, seen.cam.p)
     )  # fmt: skip
+    J[k, CALIBRATED + FOCAL] = by_lens[0]
+    J[k, CALIBRATED + METRES] = by_lens[1] - rho * dot(by_cam0, seen.cam.p)
+    by_right = cross(by_cam, seen.in_cam) if seen.cam.is_right else (0.0, 0.0, 0.0)
+    J[k, CALIBRATED + RIGHT], J[k, CALIBRATED + RIGHT + 1], J[k, CALIBRATED + RIGHT + 2] = by_right
     if same:  # moving the body moves landmark and camera alike
-        J[k, :POINT] = 0.0
+        J[k, : CALIBRATED + FOCAL] = 0.0
         J[k, SEEN:] = 0.0
         return
     by_turn_host, by_turn = cross(landmark.in_host, by_host), cross(by_seen, seen.in_seen)  # when the rows were read
@@ -227,6 +255,3 @@ def _row(landmark: Hosted, seen: Sight, row: float, active: Array, same: bool, b
     J[k, CALIBRATED] = by_time_host + by_time
     J[k, CALIBRATED + 1], J[k, CALIBRATED + 2], J[k, CALIBRATED + 3] = by_mount
     J[k, CALIBRATED + 4] = by_time_host * landmark.row + by_time * row
-    for i in range(CALIBRATION):
-        if not active[i]:
-            J[k, CALIBRATED + i] = 0.0

@@ -14,6 +14,7 @@ from vislam.core.messages import Array
 from vislam.window.equations import inertial, linear, schur, visual
 from vislam.window.equations.layout import (
     CALIBRATION,
+    RIGHT,
     Camera,
     Ints,
     Links,
@@ -28,6 +29,7 @@ from vislam.window.equations.layout import (
 
 _MAX_TRIES = 8  # of damping, each ten times the last
 _FIRST_DAMPING = 1e-4  # relative to the diagonal
+_KNOWN = 1e18  # information on what is not estimated
 _MAX_RHO = 20.0  # 1/m: nothing is seen nearer than 5 cm
 
 
@@ -36,7 +38,7 @@ class Solution(NamedTuple):
 
     X: Array  # [M, 21]
     points: Array  # [L, 3]
-    calibration: Array  # [5]
+    calibration: Array  # [16]
     U: Array  # [D, D] upper factor of the information of all states where it was last linearised, without landmarks
     squares: Array  # [N, 2] squared whitened errors of the views: pixel, depth
     cost: float  # half the robust sum of squares
@@ -56,7 +58,7 @@ class Problem:
     X_first: Array  # [M, 21]
     held: NDArray[np.bool_]  # [M]
     points: Array  # [L, 3]
-    calibration: Array  # [5]
+    calibration: Array  # [16]
     views: Views
     camera: Camera
     links: Links
@@ -156,9 +158,7 @@ class _Equations:
         add_prior(p.prior, now.dx, self._prior_where, A, g)
         count = len(now.X)
         states, normal = States(now.X, p.X_first, p.held), Normal(A, g)
-        inertial.linearise(states, p.links, p.gravity_m_s2, self._where, count - 1, count, normal)
-        fixed = len(g) - CALIBRATION + np.flatnonzero(~p.camera.active)
-        A[fixed, fixed] += 1.0
+        inertial.linearise(states, now.calibration, p.links, p.gravity_m_s2, self._where, count - 1, count, normal)
         visual.linearise(
             states, now.points, now.calibration, p.views, p.camera, self._poses_at, normal, self._landmarks
         )
@@ -166,7 +166,11 @@ class _Equations:
             np.fill_diagonal(A, np.diag(A) * (1.0 + damping))
         left = g.copy()
         self.undamped = False
-        if not schur.eliminate(self._landmarks, damping, self._poses_at, A, left) or not linear.factorise(A):
+        if not schur.eliminate(self._landmarks, damping, self._poses_at, A, left):
+            return False
+        fixed = len(g) - CALIBRATION + np.flatnonzero(~p.camera.active)
+        A[:, fixed], A[fixed], A[fixed, fixed], left[fixed] = 0.0, 0.0, _KNOWN, 0.0
+        if not linear.factorise(A):
             return False
         self._step, self.undamped = linear.solve(A, -left), damping == 0.0
         return True
@@ -198,7 +202,8 @@ class _Equations:
         dx = inertial.prior_shift(X, p.X_first, calibration, p.prior.calibration, self._held_by_prior, self._size)
         squares = np.zeros((len(p.views.values), 2))
         cost = visual.cost(X, points, calibration, p.views, p.camera, squares)
-        cost += inertial.cost(X, p.links, p.gravity_m_s2) + float(p.prior.b @ dx + 0.5 * (dx @ (p.prior.H @ dx)))
+        cost += inertial.cost(X, calibration, p.links, p.gravity_m_s2)
+        cost += float(p.prior.b @ dx + 0.5 * (dx @ (p.prior.H @ dx)))
         return _Estimate(X, points, calibration, dx, squares, cost)
 
 
@@ -219,10 +224,13 @@ def add_prior(prior: Prior, dx: Array, where: Ints, A: Array, g: Array) -> None:
 
 
 def move_calibration(calibration: Array, step: Array, active: NDArray[np.bool_]) -> Array:
-    """Return the calibration [5] after a step [5]; what is not estimated stays."""
+    """Return the calibration [16] after a step [16]; what is not estimated stays."""
     out = np.where(active, calibration + step, calibration)
     if active[1]:
         out[1:4] = so3_log(so3_exp(calibration[1:4]) @ so3_exp(step[1:4]))
+    if active[RIGHT]:
+        right = slice(RIGHT, RIGHT + 3)
+        out[right] = so3_log(so3_exp(calibration[right]) @ so3_exp(step[right]))
     return out
 
 

@@ -14,17 +14,18 @@ import numpy as np
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.core.small import minus
-from vislam.window.equations.layout import CALIBRATION, Camera, Normal, States, Views
+from vislam.window.equations.layout import Camera, Normal, States, Views
 from vislam.window.equations.projection import (
     CALIBRATED,
     COLUMNS,
     ERROR,
     POINT,
     SEEN,
+    VIEWED,
     Mount,
     Place,
     hosted,
-    lens,
+    lenses,
     linearised,
     measured,
     mounted,
@@ -37,7 +38,7 @@ from vislam.window.equations.projection import (
 from vislam.window.equations.schur import Landmarks, invert
 
 _BEHIND_COST = 50.0  # of a view that the landmark lies behind; constant, so that it neither pulls nor stops a step
-_OWN = 16  # columns of a view that belong to its landmark: host, calibration, point, error
+_OWN = 20  # columns of a view that belong to its landmark: host, calibration, point, error
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -45,7 +46,8 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
     """Return half the robust cost of all views; `squares` [N, 2] gets the squared errors of pixel and depth."""
     mount, total = mounted(camera, calibration), 0.0
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s, huber_k = camera.T_cam0_cams, camera.rate, camera.applied_offset_s, camera.huber_k
+    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    huber_k = camera.huber_k
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
@@ -54,7 +56,8 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
         for n in range(first[p], first[p + 1]):
             k, view = keyframes[n], measured(values, n)
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
-            ahead, e = residual(sight(landmark, at, mount, lens(cams, cameras[n])).in_cam, rho, view)
+            cam = cams[cameras[n]]
+            ahead, e = residual(sight(landmark, at, mount, cam).in_cam, rho, view, cam)
             if not ahead:
                 total += _BEHIND_COST
                 squares[n, 0], squares[n, 1] = 1e6, 0.0
@@ -90,8 +93,8 @@ def linearise(
     X, X_first, held = states
     mount, calibrated = mounted(camera, calibration), poses_at + 6 * len(X)
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
-    active, huber_k = camera.active, camera.huber_k
+    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    huber_k = camera.huber_k
     J, ours, theirs = np.zeros((3, COLUMNS)), np.empty((POINT + 3, _OWN)), np.empty((6, COLUMNS))
     blocks, gradients, cross = landmarks.blocks, landmarks.gradients, landmarks.cross
     cross[:] = 0.0
@@ -105,21 +108,21 @@ def linearise(
             fixed = hosted(at_fixed, mount, row, points[p, 0], points[p, 1], rho)
         ours[:] = 0.0
         for n in range(first[p], first[p + 1]):
-            k, view, cam = keyframes[n], measured(values, n), lens(cams, cameras[n])
+            k, view, cam = keyframes[n], measured(values, n), cams[cameras[n]]
             dt = shift(offsets_s, calibration, k, view.row)
             at = at_host if k == host else place(X, k, rates, dt)
             seen = sight(landmark, at, mount, cam)
-            ahead, error = residual(seen.in_cam, rho, view)
+            ahead, error = residual(seen.in_cam, rho, view, cam)
             if ahead and (held[host] or held[k]):
                 if k == host:
                     at = at_fixed
                 elif held[k]:
                     at = place(X_first, k, rates, dt)
                 seen = sight(fixed, at, mount, cam)
-                ahead = residual(seen.in_cam, rho, view)[0]
+                ahead = residual(seen.in_cam, rho, view, cam)[0]
             if not ahead:
                 continue
-            linearised(fixed, seen, view, active, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
+            linearised(fixed, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
             rows = 3 if view.depth_weight > 0.0 else 2
             _add_squares(J, rows, 0, ours)
             if k != host:
@@ -171,7 +174,7 @@ def _add_seen(
             A[poses_at + host + j, at] += theirs[i, j]
             if j >= i:
                 A[at, poses_at + seen + j] += theirs[i, SEEN + j]
-        for j in range(CALIBRATION):
+        for j in range(VIEWED):
             A[at, calibrated + j] += theirs[i, CALIBRATED + j]
         for j in range(3):
             cross[j, seen + i] += theirs[i, POINT + j]
@@ -187,7 +190,7 @@ def start(
     """
     mount = mounted(camera, calibration)
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
+    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
     for p in range(len(points)):
         if not wanted[p]:
             continue
@@ -197,7 +200,7 @@ def start(
         near = hosted(at_host, mount, own.row, own.x, own.y, 1.0)
         numerator, denominator = 1e2 * rho_start, 1e2
         for n in range(first[p], first[p + 1]):
-            k, view, cam = keyframes[n], measured(values, n), lens(cams, cameras[n])
+            k, view, cam = keyframes[n], measured(values, n), cams[cameras[n]]
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
             at_infinity = sight(far, at, mount, cam).in_cam
             by_rho = minus(sight(near, at, mount, cam).in_cam, at_infinity)
@@ -220,8 +223,8 @@ def _refine(
 ) -> None:
     """Move landmark p [3] by three Gauss-Newton steps with the poses fixed."""
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = camera.T_cam0_cams, camera.rate, camera.applied_offset_s
-    active, huber_k = camera.active, camera.huber_k
+    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    huber_k = camera.huber_k
     host, row, J = hosts[p], values[first[p], 6], np.zeros((3, COLUMNS))
     H, b, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(3):
@@ -233,11 +236,12 @@ def _refine(
         for n in range(first[p], first[p + 1]):
             k, view = keyframes[n], measured(values, n)
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
-            seen = sight(landmark, at, mount, lens(cams, cameras[n]))
-            ahead, error = residual(seen.in_cam, landmark.rho, view)
+            cam = cams[cameras[n]]
+            seen = sight(landmark, at, mount, cam)
+            ahead, error = residual(seen.in_cam, landmark.rho, view, cam)
             if not ahead:
                 continue
-            linearised(landmark, seen, view, active, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
+            linearised(landmark, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
             for m in range(3 if view.depth_weight > 0.0 else 2):
                 for i in range(3):
                     b[i] += J[m, POINT + i] * J[m, ERROR]
