@@ -80,11 +80,17 @@ def seen_from(
     return np.arange(len(rows)), np.concatenate(rows)
 
 
+def sensor(rig: Rig, sigmas: Array, R10: Array, t10: Array, focal: float = 1.0, metres: float = 1.0) -> Sensor:
+    return Sensor(rig.cameras[0].lens, rig.cameras[-1].lens, sigmas, R10, t10, focal, metres)
+
+
 def residuals(window: Window, rig: Rig, at: NDArray[np.int64], seen: Array, point: Array) -> Array:
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
     R_body_cam = np.ascontiguousarray(window.R_body_cam)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    A, _, _ = features.linearise(point, Views(at, seen, *poses), Sensor(SIGMAS, R10, t10), len(window.frames))
+    A, _, _ = features.linearise(
+        point, Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10, *window.lens), len(window.frames)
+    )
     return A[:, -1]
 
 
@@ -96,7 +102,7 @@ def test_derivatives_of_a_track(rig: Rig, readout_s: float) -> None:
     at, seen = seen_from(window, rig, readout_s, POINT)
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    A, H_f, rows = features.linearise(POINT, Views(at, seen, *poses), Sensor(SIGMAS, R10, t10), len(at))
+    A, H_f, rows = features.linearise(POINT, Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10), len(at))
     assert rows == len(at) * (2 + 2 * rig.is_stereo + rig.has_depth)
     h = 1e-6
     for j in range(16, len(window.P)):
@@ -118,8 +124,8 @@ def test_tracks_that_scatter_twice_as_much_count_as_if_told_so(rig: Rig) -> None
     _, noisy = seen_from(window, rig, 0.0, POINT, noise=2.0)
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    told = features.linearise(POINT, Views(at, seen, *poses), Sensor(2.0 * SIGMAS, R10, t10), len(at))
-    shown = features.linearise(POINT, Views(at, noisy, *poses), Sensor(SIGMAS, R10, t10), len(at))
+    told = features.linearise(POINT, Views(at, seen, *poses), sensor(rig, 2.0 * SIGMAS, R10, t10), len(at))
+    shown = features.linearise(POINT, Views(at, noisy, *poses), sensor(rig, SIGMAS, R10, t10), len(at))
     for one, other in zip(told, shown, strict=True):
         np.testing.assert_allclose(one, other)
 
@@ -179,15 +185,15 @@ def test_triangulation_in_spite_of_an_outlier(rig: Rig) -> None:
     rng, motion = np.random.default_rng(2), Motion.random(8)
     window, _ = a_window(motion)
     at, seen = seen_from(window, rig, 0.0, POINT)
-    seen[:, :2] += rng.normal(size=(4, 2)) * 1e-3
+    seen[:, 2:4] += rng.normal(size=(4, 2)) * 0.46
     R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    point, rho, sigma = features.triangulate(Views(at, seen, *poses), Sensor(SIGMAS, R10, t10))
+    point, rho, sigma = features.triangulate(Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10))
     assert np.linalg.norm(point - POINT) < 0.15
     assert 0.0 < sigma < 0.3 * rho
     spoilt = seen.copy()
-    spoilt[2, :2] += 0.08
-    robust, _, _ = features.triangulate(Views(at, spoilt, *poses), Sensor(SIGMAS, R10, t10))
+    spoilt[2, 2:4] += 37.0
+    robust, _, _ = features.triangulate(Views(at, spoilt, *poses), sensor(rig, SIGMAS, R10, t10))
     assert np.linalg.norm(robust - point) < 0.3
 
 
@@ -202,7 +208,7 @@ def test_transition_is_the_derivative_of_the_motion() -> None:
 
     def end_of(change: Array) -> Array:
         x = start.copy()
-        moved(Window(np.zeros((CLONES, CLONES)), 0.0, np.eye(3)), x, np.append(change, np.zeros(4)))
+        moved(Window(np.zeros((CLONES, CLONES)), 0.0, np.eye(3)), x, np.append(change, np.zeros(CLONES - 15)))
         moving = Inertial(x, Phi.copy(), Q.copy())
         kernels.run(moving, piece, np.empty((26, 10)), sigmas, GRAVITY_M_S2, np.eye(3))
         return x
@@ -230,12 +236,12 @@ def test_yaw_and_position_stay_unobservable() -> None:
     at, seen = seen_from(window, MONO, 0.0, POINT)
     R_body_cam, p_body_cam, R10, t10 = rig_parts(MONO)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    A, H_f, _ = features.linearise(POINT, Views(at, seen, *poses), Sensor(SIGMAS, R10, t10), len(at))
+    A, H_f, _ = features.linearise(POINT, Views(at, seen, *poses), sensor(MONO, SIGMAS, R10, t10), len(at))
     features.project_out(A, H_f)
     blind = np.zeros((len(window.P) - 3 * 2 - 16, 4))
     for i in range(len(at)):
-        blind[3 + 6 * i + 2, 0] = 1.0  # about the vertical
-        blind[3 + 6 * i + 3 : 3 + 6 * i + 6, 1:] = np.eye(3)
+        blind[features.CALIBRATION + 6 * i + 2, 0] = 1.0  # about the vertical
+        blind[features.CALIBRATION + 6 * i + 3 : features.CALIBRATION + 6 * i + 6, 1:] = np.eye(3)
     np.testing.assert_allclose(A[3:, :-1] @ blind, 0.0, atol=1e-8)
     Phi, Q = np.eye(15), np.zeros((15, 15))
     values = np.tile([0.3, -0.2, 0.4, 1.0, 2.0, 9.0], (20, 1))
@@ -263,9 +269,9 @@ def test_bookkeeping_of_the_covariance() -> None:
         G[rows, :3] = by_turn
     np.testing.assert_allclose(propagated(window, Phi, B @ B.T).P, J @ window.P @ J.T + G @ B @ B.T @ G.T, atol=1e-9)
     gone = without_points(without_clone(window, 1), np.array([True, False]))
-    kept = np.r_[0:25, 31:43, 46:49]
+    kept = np.r_[0:27, 33:45, 48:51]
     np.testing.assert_array_equal(gone.P, window.P[np.ix_(kept, kept)])
-    A, H_f = rng.normal(size=(3, 28)), rng.normal(size=(3, 3))
+    A, H_f = rng.normal(size=(3, 30)), rng.normal(size=(3, 3))
     more = with_points(window, np.array([9]), np.array([[1.0, 2.0, 3.0]]), A[None], H_f[None])
     assert np.linalg.eigvalsh(more.P)[0] > -1e-12
     np.testing.assert_allclose(more.points[-1], np.array([1.0, 2.0, 3.0]) + np.linalg.solve(H_f, A[:, -1]))
@@ -289,6 +295,6 @@ def test_bad_observations_are_left_out() -> None:
     pixels = np.array([[300.0, 200.0], [np.nan, 1.0], [300.0, np.inf], [310.0, 210.0], [1e9, 0.0]])
     frame = prepare(0, Observations(np.array([5, 6, 7, 5, 8]), pixels), MONO, 0.0)
     assert frame.ids.tolist() == [5]
-    assert np.isnan(frame.seen[0, 6:13]).all()
+    assert np.isnan(frame.seen[0, 4:9]).all()
     depth = prepare(0, Observations(np.array([1, 2]), pixels[[0, 3]], None, np.array([-1.0, 2.0])), RGBD, 0.0)
-    assert np.isnan(depth.seen[0, 12]) and depth.seen[1, 12] == 0.5
+    assert np.isnan(depth.seen[0, 8]) and depth.seen[1, 8] == 0.5

@@ -326,7 +326,7 @@ def test_a_filter_without_sensors_is_as_it_was_byte_for_byte(kind: str) -> None:
         assert_same_bytes(numbers(without), numbers(ekf))
         assert ekf.counters == without.counters
         assert not ekf.update_sensor(Reading("fix", ekf.state().t_ns, np.zeros(3))).accepted
-    assert numbers(without)[2].shape == ((21, 21) if kind == "loose" else (19, 19))
+    assert numbers(without)[2].shape == (21, 21)
     assert full.counters.keys() - without.counters.keys() == {
         f"{name}_{end}"
         for name in every_sensor()

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.jit import njit
+from vislam.core.lens import Lens, distort
 from vislam.core.messages import Array
 
 MapF32 = NDArray[np.float32]
@@ -31,49 +32,6 @@ _NO_COEFFICIENT = 1e-12  # of a polynomial in r^2: what it changes at any radius
 
 
 @njit(cache=True, nogil=True)
-def _distort(x: float, y: float, model: int, k: Array) -> tuple[float, float, float, float, float, float]:
-    """Return the distorted point and its Jacobian (du/dx, du/dy, dv/dx, dv/dy) on the plane z = 1."""
-    r2 = x * x + y * y
-    if model == 1:
-        radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-        slope = 2.0 * (k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2))
-        u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
-        v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
-        ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
-        uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
-        vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
-        return u, v, ux, uy, uy, vy
-    if model == 2:
-        r = np.sqrt(r2)
-        if r < 1e-9:
-            return x, y, 1.0, 0.0, 0.0, 1.0
-        theta = np.arctan(r)
-        t2 = theta * theta
-        bent = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-        slope = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
-        scale = bent / r
-        # d(scale)/dr divided by r, so that multiplying by x and y gives the gradient of scale
-        change = (slope / (1.0 + r2) - scale) / r2
-        return x * scale, y * scale, scale + change * x * x, change * x * y, change * x * y, scale + change * y * y
-    if model == 3:
-        over = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-        under = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
-        if not under > 0.0:  # at a pole, which lies beyond what the model can see
-            return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
-        radial = over / under
-        over_slope = k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2)
-        under_slope = k[5] + r2 * (2.0 * k[6] + 3.0 * k[7] * r2)
-        slope = 2.0 * (over_slope - radial * under_slope) / under
-        u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
-        v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
-        ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
-        uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
-        vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
-        return u, v, ux, uy, uy, vy
-    return x, y, 1.0, 0.0, 0.0, 1.0
-
-
-@njit(cache=True, nogil=True)
 def _project(points: Array, pinhole: Array, model: int, k: Array, max_r2: float) -> Array:
     out = np.full((len(points), 2), np.nan)
     fx, fy, cx, cy, skew = pinhole
@@ -84,7 +42,7 @@ def _project(points: Array, pinhole: Array, model: int, k: Array, max_r2: float)
         x, y = points[i, 0] / z, points[i, 1] / z
         if not x * x + y * y <= max_r2:  # NaN too
             continue
-        u, v, _, _, _, _ = _distort(x, y, model, k)
+        u, v, _, _, _, _ = distort(x, y, model, k)
         out[i, 0] = fx * u + skew * v + cx
         out[i, 1] = fy * v + cy
     return out
@@ -99,7 +57,7 @@ def _project_jacobian(points: Array, pinhole: Array, model: int, k: Array) -> Ar
         if not z > _MIN_Z_M:
             continue
         x, y = points[i, 0] / z, points[i, 1] / z
-        _, _, ux, uy, vx, vy = _distort(x, y, model, k)
+        _, _, ux, uy, vx, vy = distort(x, y, model, k)
         px, py = fx * ux + skew * vx, fx * uy + skew * vy
         qx, qy = fy * vx, fy * vy
         out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = px / z, py / z, -(px * x + py * y) / z
@@ -135,7 +93,7 @@ def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: floa
         x, y = _first_guess(u0, v0, model, max_r2)
         if np.isnan(x):
             continue
-        u, v, ux, uy, vx, vy = _distort(x, y, model, k)
+        u, v, ux, uy, vx, vy = distort(x, y, model, k)
         error = (u - u0) ** 2 + (v - v0) ** 2
         for _ in range(_MAX_NEWTON_STEPS):
             if error < 1e-24:
@@ -152,7 +110,7 @@ def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: floa
                 if model == 3 and xn * xn + yn * yn > max_r2:  # behind a pole other rays give the same pixel
                     step *= 0.5
                     continue
-                un, vn, uxn, uyn, vxn, vyn = _distort(xn, yn, model, k)
+                un, vn, uxn, uyn, vxn, vyn = distort(xn, yn, model, k)
                 new_error = (un - u0) ** 2 + (vn - v0) ** 2
                 if new_error < error:
                     x, y, u, v, ux, uy, vx, vy, error = xn, yn, un, vn, uxn, uyn, vxn, vyn, new_error
@@ -245,6 +203,11 @@ class Camera:
         slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]])
         theta = min(float(np.sqrt(_smallest_positive_root(slope))), np.deg2rad(89.5))
         return float(np.tan(theta) ** 2)
+
+    @cached_property
+    def lens(self) -> Lens:
+        """The camera as compiled code takes it."""
+        return Lens(self._pinhole, self._model, self._k, self._max_r2)
 
     def project(self, points_cam_m: Array) -> Array:
         """Return raw pixels [N, 2] of points [N, 3] in the camera frame; NaN behind the camera or beyond the model."""

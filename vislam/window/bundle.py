@@ -161,6 +161,7 @@ def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig, active: NDAr
     return Camera(
         T_body_cam=rig.T_body_cams[0],
         T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]]),
+        lenses=(rig.cameras[0].lens, rig.cameras[:2][-1].lens),
         rate=np.zeros((count, 3)) if problem.rate_rad_s is None else problem.rate_rad_s,
         applied_offset_s=np.zeros(count),
         active=active,
@@ -214,7 +215,7 @@ def _rescale(X: Array, links: Links, lever_m: Array, accel_bias_sigma_m_s2: floa
 def _whitened_by(views: Views, sigma: float) -> Views:
     """Return the views with errors in units of `sigma` times what they were."""
     values = views.values.copy()
-    values[:, 2:6] /= sigma
+    values[:, 4] /= sigma
     return views._replace(values=values)
 
 

@@ -88,7 +88,7 @@ def spreads(solution: Solution, views: Views) -> Array:
     groups = (
         pixels[counts & (views.camera == 0)],
         pixels[counts & (views.camera == 1)],
-        depths[counts & (views.values[:, 8] > 0.0)],
+        depths[counts & (views.values[:, 7] > 0.0)],
     )
     found = [
         np.median(g) / usual if len(g) >= _LEAST_TESTED else 1.0 for g, usual in zip(groups, _MEDIANS, strict=True)

@@ -20,21 +20,21 @@ from vislam.window.equations import (
     VIEWED,
     Camera,
     Hosted,
-    Lens,
     Links,
     Measured,
     Mount,
     Normal,
+    Optics,
     Place,
     States,
     Views,
     hosted,
     inertial,
     invert,
-    lenses,
     linearised,
     measured,
     mounted,
+    optics,
     place,
     residual,
     shift,
@@ -108,11 +108,11 @@ def innovations(
     own_block, inverse, cross = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, width))
     scratch = np.empty((2, 2, width))
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
     huber_k = camera.huber_k
     squares[:] = np.nan
     for p in range(len(points)):
-        host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
+        host, rho, row = hosts[p], points[p, 2], values[first[p], 5]
         own_block[:], cross[:] = 0.0, 0.0
         own_block[2, 2] = camera.rho_information
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
@@ -169,7 +169,7 @@ def _square(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_depth(
-    landmark: Hosted, rho_information: float, mount: Mount, at: Place, cam: Lens, view: Measured, J: Array,
+    landmark: Hosted, rho_information: float, mount: Mount, at: Place, cam: Optics, view: Measured, J: Array,
 ) -> float:  # fmt: skip
     """Return the inverse depth that explains a view best, and J of it; NaN if none is in front of the camera."""
     rho = min(max(landmark.rho, 0.0), _MAX_RHO)

@@ -14,7 +14,7 @@ from vislam.core.messages import Array, Observations
 from vislam.window.equations import Ints, Views
 
 RHO_START = 0.2  # 1/m: 5 m, where nothing is known
-_VALUES = 11  # of a view, see Views
+_VALUES = 8  # of a view, see Views
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class TrackTable:
         slots = self._slots(seen.track_ids[usable])
         self._append(slots, keyframe_id, 0, values[usable])
         if seen.right_px is not None and self._rig.is_stereo:
-            right = _whitened(self._rig.cameras[1], seen.right_px, seen.noise * self._config.right_sigma_px)
+            right = _rows_of(self._rig.cameras[1], seen.right_px, seen.noise * self._config.right_sigma_px)
             both = usable & np.isfinite(right).all(axis=1)
             if both.any():
                 place = np.cumsum(usable) - 1
@@ -72,7 +72,7 @@ class TrackTable:
         counts = np.diff(starts, append=len(order))
         with_depth = np.zeros(len(starts), dtype=bool)
         if len(starts) > 0:
-            with_depth = np.maximum.reduceat(self._values[order, 8], starts) > 0.0
+            with_depth = np.maximum.reduceat(self._values[order, 7], starts) > 0.0
         return self.arrange(order[np.repeat((counts >= 2) | with_depth, counts)], ids)
 
     def continued(self, ids: Ints) -> Ints:
@@ -142,11 +142,11 @@ class TrackTable:
     def _measure(self, seen: Observations) -> tuple[Array, NDArray[np.bool_]]:
         at_once = seen.instant_px is not None
         pixels = seen.pixels_px if seen.instant_px is None else seen.instant_px
-        values = _whitened(self._rig.cameras[0], pixels, seen.noise * self._config.sigma_px, at_once)
+        values = _rows_of(self._rig.cameras[0], pixels, seen.noise * self._config.sigma_px, at_once)
         if seen.depth_m is not None:
             known = np.isfinite(seen.depth_m) & (seen.depth_m > 0.0)
-            values[known, 7] = 1.0 / seen.depth_m[known]
-            values[known, 8] = 1.0 / (seen.noise * self._config.depth_sigma_rho)
+            values[known, 6] = 1.0 / seen.depth_m[known]
+            values[known, 7] = 1.0 / (seen.noise * self._config.depth_sigma_rho)
         return values, np.asarray(np.isfinite(values).all(axis=1))
 
 
@@ -166,17 +166,15 @@ def check_observations(seen: Observations, where: str) -> None:
         raise DataError(f"{where}: depths of shape {seen.depth_m.shape} for {count} tracks; use NaN where unknown")
 
 
-def _whitened(camera: Camera, pixels_px: Array, sigma_px: float, at_once: bool = False) -> Array:
-    """Return rows [N, 11] of the table without depth; NaN where no ray gives the pixel.
+def _rows_of(camera: Camera, pixels_px: Array, sigma_px: float, at_once: bool = False) -> Array:
+    """Return rows [N, 8] of the table without depth; NaN where no ray gives the pixel.
 
     `at_once` says that all rows of the image count as seen at the frame's own time.
     """
     out = np.zeros((len(pixels_px), _VALUES))
-    xy = camera.normalise(pixels_px)
-    out[:, :2] = xy
-    rays = np.column_stack([xy, np.ones(len(xy))])
-    out[:, 2:6] = camera.project_jacobian(rays)[:, :, :2].reshape(-1, 4) / sigma_px
-    out[:, 9:11] = (pixels_px - (camera.cx, camera.cy)) / sigma_px
+    out[:, :2] = camera.normalise(pixels_px)
+    out[:, 2:4] = pixels_px - (camera.cx, camera.cy)
+    out[:, 4] = 1.0 / sigma_px
     if not at_once:
-        out[:, 6] = pixels_px[:, 1] / camera.height - 0.5
+        out[:, 5] = pixels_px[:, 1] / camera.height - 0.5
     return out

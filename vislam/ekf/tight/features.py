@@ -1,8 +1,9 @@
 """Compiled arithmetic of tracks: where a point is, what its pixels say about the poses they were seen from.
 
-One observation is a row [15]: direction x, y on z = 1; d(pixel)/d(x, y) [2, 2] by rows; the same six numbers for the
+One observation is a row [11]: direction x, y on z = 1 and pixel from the principal point; the same four numbers for the
 right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read; its standard deviations
-over those given. NaN where not measured.
+over those given. NaN where not measured. Predictions go through the lens: derivatives at the pixel that was measured
+would have its noise in common with the residual, and the focal length would drift by it.
 Residuals are whitened: left pixels; right minus left pixels (matching left to right is better than following a corner
 over time, and both share the error of the corner); inverse depth.
 """
@@ -16,10 +17,12 @@ from numpy.typing import NDArray
 
 from vislam.core.geometry import skew, so3_exp
 from vislam.core.jit import njit
+from vislam.core.lens import Lens, imaged
 from vislam.core.messages import Array
 from vislam.core.small import by, in_a_row, minus, plus, times, turned
 
-COLUMNS = 15
+COLUMNS = 11
+CALIBRATION = 5  # errors that all observations share: rotation of the camera (3), focal length, metres
 ROWS_MAX = 5  # of one observation
 _STEPS = 10
 _CONVERGED = 1e-4  # of the cost
@@ -33,9 +36,13 @@ USED, FEW, PARALLAX, RANGE, OUTLIER, GATED = 0, 1, 2, 3, 4, 5
 class Sensor(NamedTuple):
     """What the cameras measure with."""
 
+    lens: Lens  # of cam0
+    right: Lens  # of cam1; any, without one
     sigmas: Array  # [3] pixels, disparity in pixels, inverse depth in 1/m
     R_cam1_cam0: Array  # [3, 3] rotation into the right camera
     t_cam1_cam0: Array  # [3] origin of cam0 in the right camera
+    focal: float = 1.0  # times what was given, as `metres`: the baseline or the unit of depth
+    metres: float = 1.0
     spread: float = 1.0  # of whitened rows as they turn out, at most 1: outliers are judged by it
 
 
@@ -43,7 +50,7 @@ class Views(NamedTuple):
     """Observations, and where each was made from."""
 
     at: NDArray[np.int64]  # [M] clone
-    seen: Array  # [M, 15] rows as above
+    seen: Array  # [M, 11] rows as above
     R_cam: Array  # [M, 3, 3] R_cam_world
     centres: Array  # [M, 3] of the camera
 
@@ -71,51 +78,59 @@ class Tracks(NamedTuple):
     status: NDArray[np.int64]  # [F]
     points: Array  # [F, 3] m
     tests: Array  # [F, 4] NIS by the spread, degrees of freedom, relative sigma of inverse depth, NIS as whitened
-    fixing: Array  # [F, 3, 3 + 6 C + 1] the rows that fix each point, as in `linearise`
+    fixing: Array  # [F, 3, 5 + 6 C + 1] the rows that fix each point, as in `linearise`
     H_points: Array  # [F, 3, 3] and by the point
-    rows: Array  # [m, 3 + 6 C + 1] the projected rows of all used tracks, stacked
+    rows: Array  # [m, 5 + 6 C + 1] the projected rows of all used tracks, stacked
 
 
 @njit(cache=True, nogil=True)
-def observe(y: Array, seen: Array, sensor: Sensor, r: Array, J: Array) -> int:
-    """Write the whitened residuals r [5] and d(prediction)/dy J [5, 3] of a point y [3] in cam0; return their number.
+def observe(y: Array, seen: Array, sensor: Sensor, r: Array, J: Array, by_lens: Array) -> int:
+    """Write the whitened residuals r [5] of a point y [3] in cam0 and derivatives of predictions; return how many.
 
-    0 rows: the point is not in front of the camera.
+    By y J [5, 3], by focal length and metres `by_lens` [5, 2]. 0 rows: the point is not in front of the camera.
     """
     if not y[2] > 1e-6:
         return 0
-    sigmas, R_cam1_cam0, t_cam1_cam0, _ = sensor
-    pixel, disparity, depth = sigmas[0] * seen[14], sigmas[1] * seen[14], sigmas[2] * seen[14]
+    lens, right, sigmas, R_cam1_cam0, t_cam1_cam0, focal, metres, _ = sensor
+    pixel, disparity, depth = sigmas[0] * seen[10], sigmas[1] * seen[10], sigmas[2] * seen[10]
     z = 1.0 / y[2]
-    ex = seen[0] - y[0] * z
-    ey = seen[1] - y[1] * z
+    u, v, ux, uy, vx, vy = imaged(y[0] * z, y[1] * z, lens)
+    if not np.isfinite(u):
+        return 0
     for i in range(2):
-        a, b = seen[2 + 2 * i], seen[3 + 2 * i]
-        r[i] = a * ex + b * ey
+        at, a, b = (u, focal * ux, focal * uy) if i == 0 else (v, focal * vx, focal * vy)
+        r[i] = seen[2 + i] - focal * at
+        by_lens[i, 0], by_lens[i, 1] = at, 0.0
         J[i, 0], J[i, 1], J[i, 2] = a * z, b * z, -(a * y[0] + b * y[1]) * z * z
     rows = 2
-    if np.isfinite(seen[6]):
-        R1, t1 = R_cam1_cam0, t_cam1_cam0
+    if np.isfinite(seen[4]):
+        R1, t1 = R_cam1_cam0, metres * t_cam1_cam0
         y10 = R1[0, 0] * y[0] + R1[0, 1] * y[1] + R1[0, 2] * y[2] + t1[0]
         y11 = R1[1, 0] * y[0] + R1[1, 1] * y[1] + R1[1, 2] * y[2] + t1[1]
         y12 = R1[2, 0] * y[0] + R1[2, 1] * y[1] + R1[2, 2] * y[2] + t1[2]
         if not y12 > 1e-6:
             return 0
         z1 = 1.0 / y12
-        ex, ey = seen[6] - y10 * z1, seen[7] - y11 * z1
+        u, v, ux, uy, vx, vy = imaged(y10 * z1, y11 * z1, right)
+        if not np.isfinite(u):
+            return 0
         for i in range(2):
-            a, b = seen[8 + 2 * i], seen[9 + 2 * i]
-            r[rows] = (a * ex + b * ey - r[i]) / disparity
+            at, a, b = (u, focal * ux, focal * uy) if i == 0 else (v, focal * vx, focal * vy)
+            r[rows] = (seen[6 + i] - focal * at - r[i]) / disparity
+            by_lens[rows, 0] = (at - by_lens[i, 0]) / disparity
             d0, d1, d2 = a * z1, b * z1, -(a * y10 + b * y11) * z1 * z1
+            by_lens[rows, 1] = (d0 * t1[0] + d1 * t1[1] + d2 * t1[2]) / metres / disparity
             for k in range(3):
                 J[rows, k] = (d0 * R1[0, k] + d1 * R1[1, k] + d2 * R1[2, k] - J[i, k]) / disparity
             rows += 1
-    if np.isfinite(seen[12]):
-        r[rows] = (seen[12] - z) / depth
-        J[rows, 0], J[rows, 1], J[rows, 2] = 0.0, 0.0, -z * z / depth
+    if np.isfinite(seen[8]):
+        r[rows] = (seen[8] - metres * z) / depth
+        J[rows, 0], J[rows, 1], J[rows, 2] = 0.0, 0.0, -metres * z * z / depth
+        by_lens[rows, 0], by_lens[rows, 1] = 0.0, z / depth
         rows += 1
     for i in range(2):
         r[i] /= pixel
+        by_lens[i, 0] /= pixel
         for k in range(3):
             J[i, k] /= pixel
     return rows
@@ -132,7 +147,7 @@ def camera_poses(
     R_body_cam: Array,
     p_body_cam: Array,
 ) -> tuple[Array, Array]:
-    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 15] made from the clones `at` [M].
+    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 11] made from the clones `at` [M].
 
     Clones: R [C, 3, 3], p [C, 3], body rate [C, 3], world velocity [C, 3]; the last two carry the pose to the time at
     which a rolling shutter read the row.
@@ -142,9 +157,9 @@ def camera_poses(
     for m in range(len(at)):
         i = at[m]
         R_world_body, centre = R[i].copy(), p[i].copy()
-        if seen[m, 13] != 0.0:
-            R_world_body = R_world_body @ so3_exp(rate[i] * seen[m, 13])
-            centre = centre + velocity[i] * seen[m, 13]
+        if seen[m, 9] != 0.0:
+            R_world_body = R_world_body @ so3_exp(rate[i] * seen[m, 9])
+            centre = centre + velocity[i] * seen[m, 9]
         out_c[m] = centre + R_world_body @ p_body_cam
         out_R[m] = (R_world_body @ R_body_cam).T
     return out_R, out_c
@@ -196,16 +211,16 @@ def _first_rho(views: Views, sensor: Sensor) -> float:
     base = np.array([seen[0, 0], seen[0, 1], 1.0])
     ray = R_cam[0].T @ base
     for m in range(len(seen)):
-        if m == 0 and np.isfinite(seen[m, 12]):
-            return min(max(seen[m, 12], _FAR_RHO), _NEAR_RHO)
+        if m == 0 and np.isfinite(seen[m, 8]):
+            return min(max(seen[m, 8], _FAR_RHO), _NEAR_RHO)
         # (direction seen) x (rho (c0 - c) + ray) = 0 in camera m is linear in rho
         a, b = R_cam[m] @ ray, R_cam[m] @ (centres[0] - centres[m])
         d = np.array([seen[m, 0], seen[m, 1], 1.0])
         u, w = np.cross(d, a), np.cross(d, b)
         total -= float(u @ w)
         weight += float(w @ w)
-        if np.isfinite(seen[m, 6]):
-            d = np.array([seen[m, 6], seen[m, 7], 1.0])
+        if np.isfinite(seen[m, 4]):
+            d = np.array([seen[m, 4], seen[m, 5], 1.0])
             u, w = np.cross(d, sensor.R_cam1_cam0 @ a), np.cross(d, sensor.R_cam1_cam0 @ b + sensor.t_cam1_cam0)
             total -= float(u @ w)
             weight += float(w @ w)
@@ -220,13 +235,13 @@ def _normal(state: Array, views: Views, R_a: Array, sensor: Sensor, r: Array, J:
     g = np.zeros(3)
     cost = 0.0
     away = 1.0 / state[2]
-    y, G, JG = np.empty(3), np.empty((3, 3)), np.empty(3)
+    y, G, JG, by_lens = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((ROWS_MAX, 2))
     rows_a, first = in_a_row(R_a), (centres[0, 0], centres[0, 1], centres[0, 2])
     offset = times(away, by(rows_a, (state[0], state[1], 1.0)))
     for m in range(len(seen)):
         R = in_a_row(R_cam[m])
         y[0], y[1], y[2] = by(R, minus(plus(offset, first), (centres[m, 0], centres[m, 1], centres[m, 2])))
-        rows = observe(y, seen[m], sensor, r, J)
+        rows = observe(y, seen[m], sensor, r, J, by_lens)
         if rows == 0:
             cost += 100.0
             continue
@@ -251,29 +266,30 @@ def _normal(state: Array, views: Views, R_a: Array, sensor: Sensor, r: Array, J:
 
 @njit(cache=True, nogil=True)
 def linearise(point: Array, views: Views, sensor: Sensor, clones: int) -> tuple[Array, Array, int]:
-    """Return A [rows, 3 + 6 C + 1] and H_f [rows, 3] of one point, and the rows; 0: it is behind a camera.
+    """Return A [rows, 5 + 6 C + 1] and H_f [rows, 3] of one point, and the rows; 0: it is behind a camera.
 
-    A holds the derivatives of the prediction by the extrinsic rotation (camera side) and by the clones (right-
-    invariant, rotation then position each), then the residual. H_f: by the point, in world axes.
+    A holds the derivatives of the prediction by the extrinsic rotation (camera side), focal length, metres and by the
+    clones (right-invariant, rotation then position each), then the residual. H_f: by the point, in world axes.
     """
     at, seen, R_cam, centres = views
-    width = 3 + 6 * clones + 1
+    width = CALIBRATION + 6 * clones + 1
     A = np.zeros((ROWS_MAX * len(at), width))
     H_f = np.zeros((ROWS_MAX * len(at), 3))
     r = np.empty(ROWS_MAX)
-    J = np.empty((ROWS_MAX, 3))
+    J, by_lens = np.empty((ROWS_MAX, 3)), np.empty((ROWS_MAX, 2))
     S = skew(point)
     n = 0
     for m in range(len(at)):
         y = R_cam[m] @ (point - centres[m])
-        rows = observe(y, seen[m], sensor, r, J)
+        rows = observe(y, seen[m], sensor, r, J, by_lens)
         if rows == 0:
             return A, H_f, 0
         by_point = J[:rows] @ R_cam[m]
         by_turn = by_point @ S
         by_mount = J[:rows] @ skew(y)
-        first = 3 + 6 * at[m]
+        first = CALIBRATION + 6 * at[m]
         for i in range(rows):
+            A[n + i, 3], A[n + i, 4] = by_lens[i, 0], by_lens[i, 1]
             for k in range(3):
                 A[n + i, k] = by_mount[i, k]
                 A[n + i, first + k] = by_turn[i, k]
@@ -345,11 +361,11 @@ def _fitting(point: Array, views: Views, sensor: Sensor, outlier: float) -> NDAr
     """Return which observations of a point are not farther from it than an outlier (in standard deviations)."""
     _, seen, R_cam, centres = views
     keep = np.zeros(len(seen), dtype=np.bool_)
-    r = np.empty(ROWS_MAX)
+    r, by_lens = np.empty(ROWS_MAX), np.empty((ROWS_MAX, 2))
     J = np.empty((ROWS_MAX, 3))
     for m in range(len(seen)):
         y = R_cam[m] @ (point - centres[m])
-        rows = observe(y, seen[m], sensor, r, J)
+        rows = observe(y, seen[m], sensor, r, J, by_lens)
         keep[m] = rows > 0 and r[0] * r[0] + r[1] * r[1] < outlier * outlier
     return np.flatnonzero(keep)
 
@@ -364,7 +380,7 @@ def process(
         starts: [F + 1] first observation of each track in what follows.
         views: of all tracks.
         sensor: see there.
-        prior: of extrinsic rotation and clones, n = 3 + 6 C.
+        prior: of what observations share and of clones, n = 5 + 6 C.
         bounds: of tracks that are used.
         limits: [d] chi-square limit of d degrees of freedom.
     """
@@ -372,7 +388,7 @@ def process(
     P, change = prior
     count = len(starts) - 1
     width = len(P) + 1
-    clones = (len(P) - 3) // 6
+    clones = (len(P) - CALIBRATION) // 6
     status = np.full(count, FEW)
     points = np.zeros((count, 3))
     tests = np.zeros((count, 4))
@@ -387,7 +403,7 @@ def process(
         chosen = s + _fitting(point, own, sensor, bounds.outlier_sigmas)
         enough = 0
         for m in chosen:
-            enough += 3 if np.isfinite(seen[m, 6]) or np.isfinite(seen[m, 12]) else 1
+            enough += 3 if np.isfinite(seen[m, 4]) or np.isfinite(seen[m, 8]) else 1
         if len(chosen) < 2 or enough < bounds.min_views:
             continue
         tests[f, 2] = sigma / rho

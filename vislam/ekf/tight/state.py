@@ -1,9 +1,9 @@
 """What the tight filter estimates beside its inertial state, and the moves on it: clone, forget, correct.
 
-Error state [19 + 6 C + 3 S + K]: the 15 inertial ones (`kernels`), time offset 15, extrinsic rotation 16:19 (camera
-side), clones (rotation, position), points kept in the state, own variables of sensors. Clones and points are
-right-invariant too: a point is `Exp(e) f^ + e_f` with the rotation error e of the body now. Everything here is
-replaced, never changed in place, so that a checkpoint is a reference.
+Error state [21 + 6 C + 3 S + K]: the 15 inertial ones (`kernels`), time offset 15, extrinsic rotation 16:19 (camera
+side), focal length 19 and metres 20, clones (rotation, position), points kept in the state, own variables of sensors.
+Clones and points are right-invariant too: a point is `Exp(e) f^ + e_f` with the rotation error e of the body now.
+Everything here is replaced, never changed in place, so that a checkpoint is a reference.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from vislam.ekf.tight.tracks import FrameTracks
 
 TIME = 15
 MOUNT = slice(16, 19)
-CLONES = 19
+FOCAL, METRES = 19, 20
+CLONES = 21
 
 
 def _none(*shape: int) -> Array:
@@ -65,6 +66,7 @@ class Window:
     rested_t_ns: int = 0  # stamp of the newest frame at which it still rested
     # [2] of tracks and of points, by how much whitened rows scatter as they turn out, at most 1
     spread: Array = field(default_factory=lambda: np.ones(2))
+    lens: Array = field(default_factory=lambda: np.ones(2))  # true focal length and metres over those given
     rejects: int = 0  # frames in a row whose tracks contradict the state
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0
@@ -213,7 +215,7 @@ def with_points(window: Window, ids: NDArray[np.int64], points: Array, fixing: A
         window: as it was when the tracks were linearised.
         ids: [K] track ids.
         points: [K, 3] where they were linearised.
-        fixing: [K, 3, 3 + 6 C + 1] rows that fix each point, by extrinsic rotation and clones, then the residual.
+        fixing: [K, 3, 5 + 6 C + 1] rows that fix each point, by what observations share and clones, then the residual.
         H_points: [K, 3, 3] the same rows by the point.
     """
     n, C = len(window.P), len(window.frames)
@@ -248,7 +250,7 @@ def depth_ratios(window: Window, points: Array, fixing: Array, H_points: Array) 
     newest = len(window.frames) - 1
     visible = slice(16, window.first_point)
     P = window.P[visible, visible]
-    at = 3 + 6 * newest
+    at = CLONES - MOUNT.start + 6 * newest
     out = np.empty(len(points))
     for k in range(len(points)):
         ray = points[k] - window.p[newest]
@@ -295,6 +297,7 @@ def moved(window: Window, x: Array, change: Array) -> Window:
         window,
         time_offset_s=window.time_offset_s + float(change[TIME]),
         R_body_cam=window.R_body_cam @ so3_exp(np.ascontiguousarray(change[MOUNT])),
+        lens=window.lens + change[FOCAL : METRES + 1],
         R=R,
         p=p,
         velocity=velocity,
@@ -321,7 +324,7 @@ def _retract(x: Array, R: Array, p: Array, velocity: Array, points: Array, chang
     C = len(R)
     column = np.empty(3)
     for k in range(C):
-        at = 19 + 6 * k
+        at = CLONES + 6 * k
         by = change[at : at + 3]
         turn_k = so3_exp(by)
         for j in range(3):
@@ -333,7 +336,7 @@ def _retract(x: Array, R: Array, p: Array, velocity: Array, points: Array, chang
         _move(turn_k, p[k], so3_left_jacobian(by), change[at + 3 : at + 6])
         _move(turn_k, velocity[k], J, none)
     for s in range(len(points)):
-        at = 19 + 6 * C + 3 * s
+        at = CLONES + 6 * C + 3 * s
         _move(turned, points[s], J, change[at : at + 3])
 
 

@@ -22,7 +22,7 @@ class FrameTracks:
     t_ns: int  # stamp of the frame
     ids: NDArray[np.int64]  # [N] ascending
     pixels_px: Array  # [N, 2]
-    seen: Array  # [N, 15] rows of `features`
+    seen: Array  # [N, 11] rows of `features`
     unused: NDArray[np.bool_]  # [N] each observation is used once
     shows_scale: bool = True  # False: the motion before it was too uniform for one camera to see how large things are
 
@@ -46,24 +46,22 @@ def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float, s
     pixels = np.asarray(given, dtype=np.float64).reshape(-1, 2)[first]
     seen = np.full((len(ids), COLUMNS), np.nan)
     camera = rig.cameras[0]
-    seen[:, :6] = _rays(camera, pixels)
+    seen[:, :4] = _rays(camera, pixels)
     if observations.right_px is not None and rig.is_stereo:
-        seen[:, 6:12] = _rays(rig.cameras[1], np.asarray(observations.right_px, dtype=np.float64)[first])
+        seen[:, 4:8] = _rays(rig.cameras[1], np.asarray(observations.right_px, dtype=np.float64)[first])
     if observations.depth_m is not None:
         depth = np.asarray(observations.depth_m, dtype=np.float64)[first]
         good = np.isfinite(depth) & (depth > 0.0)
-        seen[good, 12] = 1.0 / depth[good]
+        seen[good, 8] = 1.0 / depth[good]
     rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
-    seen[:, 13] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
-    seen[:, 14] = observations.noise
-    fit = np.isfinite(seen[:, :6]).all(axis=1) & np.isfinite(seen[:, 13])
+    seen[:, 9] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
+    seen[:, 10] = observations.noise
+    fit = np.isfinite(seen[:, :4]).all(axis=1) & np.isfinite(seen[:, 9])
     return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_), shows_scale)
 
 
 def _rays(camera: Camera, pixels: Array) -> Array:
-    xy = camera.normalise(pixels)
-    by_ray = camera.project_jacobian(np.column_stack((xy, np.ones(len(xy)))))
-    return np.column_stack((xy, by_ray[:, :, :2].reshape(-1, 4)))
+    return np.column_stack((camera.normalise(pixels), pixels - (camera.cx, camera.cy)))
 
 
 def ripe_tracks(frames: tuple[FrameTracks, ...], leaving: int | None, least: int, most: int) -> Ripe:
@@ -97,7 +95,7 @@ def ripe_tracks(frames: tuple[FrameTracks, ...], leaving: int | None, least: int
 
 
 def seen_at(frames: tuple[FrameTracks, ...], at: NDArray[np.int64], row: NDArray[np.int64]) -> Array:
-    """Return rows [M, 15] of `features`, each of the frame `at` [M] and the row within it."""
+    """Return rows [M, 11] of `features`, each of the frame `at` [M] and the row within it."""
     begins = np.cumsum([0, *(len(frame.ids) for frame in frames[:-1])])
     return np.asarray(np.concatenate([frame.seen for frame in frames])[begins[at] + row])
 

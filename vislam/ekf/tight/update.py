@@ -24,6 +24,9 @@ from vislam.ekf.loose.kernels import pose
 from vislam.ekf.tight import features
 from vislam.ekf.tight.kernels import from_nav_error
 from vislam.ekf.tight.state import (
+    CLONES,
+    FOCAL,
+    METRES,
     Window,
     cloned,
     compressed,
@@ -87,7 +90,7 @@ class _Rows:
     ids: NDArray[np.int64]  # [K], best known depth first
     points: Array  # [K, 3]
     ratios: Array  # [K]
-    fixing: Array  # [K, 3, 3 + 6 C + 1] see `with_points`
+    fixing: Array  # [K, 3, 5 + 6 C + 1] see `with_points`
     H_points: Array  # [K, 3, 3]
 
 
@@ -102,8 +105,9 @@ class FrameUpdater:
         T_cam1_cam0 = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
         sigmas = np.array([config.tight_pixel_sigma_px, _STEREO_SIGMA_PX, _DEPTH_SIGMA_RHO])
         into_right = np.ascontiguousarray(T_cam1_cam0[:3, :3]), np.ascontiguousarray(T_cam1_cam0[:3, 3])
-        self._sensor = features.Sensor(sigmas, *into_right)
-        self._point_sensor = features.Sensor(sigmas * np.array([config.tight_point_inflation, 1.0, 1.0]), *into_right)
+        lenses = rig.cameras[0].lens, rig.cameras[:2][-1].lens
+        self._sensor = features.Sensor(*lenses, sigmas, *into_right)
+        self._point_sensor = self._sensor._replace(sigmas=sigmas * np.array([config.tight_point_inflation, 1.0, 1.0]))
         self._bounds = features.Bounds(
             min_rho=1.0 / _MAX_RANGE_M,
             max_rho=1.0 / _MIN_RANGE_M,
@@ -186,7 +190,7 @@ class FrameUpdater:
         at = np.full(len(found), newest, dtype=np.int64)
         views = self._views(window, at, frame.seen[row])
         prior = features.Prior(window.P, change)
-        sensor = self._point_sensor._replace(spread=float(window.spread[1]))
+        sensor = _as_found(self._point_sensor, window, 1)
         H_points, r_points, tests = _point_rows(
             found, window.points, views, sensor, prior, len(window.frames), self._limits
         )
@@ -225,7 +229,7 @@ class FrameUpdater:
             )  # fmt: skip
         views = self._views(window, ripe.at, seen_at(window.frames, ripe.at, ripe.row))
         prior = features.Prior(np.ascontiguousarray(window.P[visible, visible]), np.ascontiguousarray(change[visible]))
-        sensor = self._sensor._replace(spread=float(window.spread[0]))
+        sensor = _as_found(self._sensor, window, 0)
         status, points, tests, fixing, H_points, stack = features.process(
             ripe.starts, views, sensor, prior, self._bounds, self._limits
         )
@@ -308,6 +312,12 @@ class FrameUpdater:
         return without_points(fresh, np.ones(len(window.point_ids), dtype=np.bool_))
 
 
+def _as_found(sensor: features.Sensor, window: Window, which: int) -> features.Sensor:
+    """Return a sensor as the window has it, with the spread of tracks (0) or points (1)."""
+    focal, metres = window.lens.tolist()
+    return sensor._replace(focal=focal, metres=metres, spread=float(window.spread[which]))
+
+
 def _followed(spread: float, tests: Array) -> float:
     """Return how much rows scatter over their sigmas, after more tests [K, >= 2] of NIS by it and degrees of freedom.
 
@@ -350,43 +360,45 @@ def _point_rows(
     r_all = np.empty(features.ROWS_MAX * len(which))
     tests = np.zeros((len(which), 3))
     r = np.empty(features.ROWS_MAX)
-    J = np.empty((features.ROWS_MAX, 3))
-    clone = 19 + 6 * (clones - 1)
-    columns = np.empty(15, dtype=np.int64)
-    small = np.empty((15, 15))
+    J, by_lens = np.empty((features.ROWS_MAX, 3)), np.empty((features.ROWS_MAX, 2))
+    clone = CLONES + 6 * (clones - 1)
+    columns = np.empty(17, dtype=np.int64)
+    columns[15], columns[16] = FOCAL, METRES
+    small = np.empty((17, 17))
     m = 0
     for k in range(len(which)):
         f = points[which[k]]
         y = R_cam[k] @ (f - centres[k])
-        rows = features.observe(y, seen[k], sensor, r, J)
+        rows = features.observe(y, seen[k], sensor, r, J, by_lens)
         if rows == 0:
             tests[k, 0] = tests[k, 2] = np.inf
             continue
         by_point = J[:rows] @ R_cam[k]
         by_turn = by_point @ skew(f)
-        h = np.zeros((rows, 15))
+        h = np.zeros((rows, 17))
         h[:, 0:3] = -by_turn
         h[:, 3:6] = J[:rows] @ skew(y)
         h[:, 6:9] = by_turn
         h[:, 9:12] = -by_point
         h[:, 12:15] = by_point
+        h[:, 15:] = by_lens[:rows]
         for i in range(3):
             columns[i], columns[3 + i] = i, 16 + i
             columns[6 + i], columns[9 + i] = clone + i, clone + 3 + i
-            columns[12 + i] = 19 + 6 * clones + 3 * which[k] + i
-        for i in range(15):
-            for j in range(15):
+            columns[12 + i] = CLONES + 6 * clones + 3 * which[k] + i
+        for i in range(17):
+            for j in range(17):
                 small[i, j] = P[columns[i], columns[j]]
         residual = r[:rows].copy()
         for i in range(rows):
-            for j in range(15):
+            for j in range(17):
                 residual[i] += h[i, j] * change[columns[j]]
         tests[k, 0], tests[k, 2] = features.gate(h, residual, small, sensor.spread)
         tests[k, 1] = rows
         if not tests[k, 0] <= limits[rows]:
             continue
         for i in range(rows):
-            for j in range(15):
+            for j in range(17):
                 H[m + i, columns[j]] = h[i, j]
             r_all[m + i] = residual[i]
         m += rows

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vislam.core.geometry import so3_exp, so3_log
 from vislam.core.jit import njit
+from vislam.core.lens import Lens
 from vislam.core.messages import Array
 from vislam.core.small import product, product_back
 
@@ -48,9 +49,10 @@ class Views(NamedTuple):
     host: Ints  # [L] keyframe whose camera 0 holds bearing and inverse depth
     keyframe: Ints  # [N]
     camera: Ints  # [N] 0 or 1
-    values: Array  # [N, 11] x and y on z = 1; [2, 2] that turns an error there into standard deviations; row of the
-    # image, -0.5 at the top to 0.5; 1/z that was measured, 1/m, and 1 / its sigma, 0 where it was not; pixel from the
-    # principal point in standard deviations
+    values: (
+        Array  # [N, 8] x and y on z = 1; pixel from the principal point and 1 / its sigma; row of the image, -0.5 at
+    )
+    # the top to 0.5; 1/z that was measured, 1/m, and 1 / its sigma, 0 where it was not
 
 
 class Links(NamedTuple):
@@ -80,6 +82,7 @@ class Camera(NamedTuple):
 
     T_body_cam: Array  # [4, 4] of camera 0
     T_cam0_cams: Array  # [C, 4, 4]
+    lenses: tuple[Lens, Lens]  # of camera 0 and of the last one
     rate: Array  # [M, 3] of the body at each keyframe, rad/s
     applied_offset_s: Array  # [M] time offset that is already in the stamp
     active: NDArray[np.bool_]  # [16] what is estimated

@@ -2,7 +2,8 @@
 
 A landmark is a bearing [a, b, 1] and an inverse depth rho in camera 0 of its host at the time its row was read; on its
 way it is scaled by rho. A camera at time `dt` after its keyframe's stamp sits at `R @ exp(rate * dt), p + v * dt`.
-Vectors and rotations are tuples here, which the compiler keeps in registers.
+Vectors and rotations are tuples here, which the compiler keeps in registers. Predictions go through the lens: with the
+derivative at the pixel that was measured, whose noise the residual has, too, focal lengths would drift by it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from vislam.core.geometry import so3_exp
 from vislam.core.jit import njit
+from vislam.core.lens import Lens, imaged
 from vislam.core.messages import Array
 from vislam.core.small import Mat, Vec, back, by, cross, dot, in_a_row, minus, plus, product, times, turned
 from vislam.window.equations.layout import FOCAL, METRES, RIGHT, Camera
@@ -27,17 +29,14 @@ _MIN_Z = 0.02  # relative to the host's depth: nearer is beside or behind the ca
 class Measured(NamedTuple):
     """A view as the front end measured it; see `layout.Views`."""
 
-    x: float
+    x: float  # on z = 1, for a first guess
     y: float
-    white_xx: float
-    white_xy: float
-    white_yx: float
-    white_yy: float
+    u: float  # px from the principal point
+    v: float
+    weight: float  # 1 / sigma of a pixel
     row: float
     inverse_depth: float
     depth_weight: float
-    off_x: float  # from the principal point, standard deviations
-    off_y: float
 
 
 class Mount(NamedTuple):
@@ -47,7 +46,7 @@ class Mount(NamedTuple):
     p: Vec
 
 
-class Lens(NamedTuple):
+class Optics(NamedTuple):
     """A camera in camera 0, and how it images."""
 
     R: Mat
@@ -55,6 +54,7 @@ class Lens(NamedTuple):
     metres: float  # by which p and measured depths are as calibrated
     focal: float
     is_right: bool
+    lens: Lens
 
 
 class Place(NamedTuple):
@@ -86,7 +86,7 @@ class Sight(NamedTuple):
     gap: Vec  # from this body to the host, world axes
     in_seen: Vec  # body axes
     in_cam0: Vec
-    cam: Lens
+    cam: Optics
     in_cam: Vec
 
 
@@ -94,8 +94,7 @@ class Sight(NamedTuple):
 def measured(values: Array, n: int) -> Measured:
     """Return view n."""
     return Measured(
-        values[n, 0], values[n, 1], values[n, 2], values[n, 3], values[n, 4], values[n, 5], values[n, 6], values[n, 7],
-        values[n, 8], values[n, 9], values[n, 10],
+        values[n, 0], values[n, 1], values[n, 2], values[n, 3], values[n, 4], values[n, 5], values[n, 6], values[n, 7]
     )  # fmt: skip
 
 
@@ -107,13 +106,14 @@ def mounted(camera: Camera, calibration: Array) -> Mount:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lenses(T: Array, calibration: Array) -> tuple[Lens, Lens]:
-    """Return the cameras in camera 0, of T_cam0_cams [C, 4, 4]; of one camera twice the same."""
+def optics(camera: Camera, calibration: Array) -> tuple[Optics, Optics]:
+    """Return both cameras as the calibration has them; of one camera twice the same."""
+    T, (left, right) = camera.T_cam0_cams, camera.lenses
     metres, focal, last = 1.0 + calibration[METRES], 1.0 + calibration[FOCAL], T[-1]
     turned = product(last, so3_exp(calibration[RIGHT : RIGHT + 3]))
     return (
-        Lens(in_a_row(T[0]), (T[0, 0, 3], T[0, 1, 3], T[0, 2, 3]), metres, focal, False),
-        Lens(in_a_row(turned), (last[0, 3], last[1, 3], last[2, 3]), metres, focal, True),
+        Optics(in_a_row(T[0]), (T[0, 0, 3], T[0, 1, 3], T[0, 2, 3]), metres, focal, False, left),
+        Optics(in_a_row(turned), (last[0, 3], last[1, 3], last[2, 3]), metres, focal, True, right),
     )
 
 
@@ -142,7 +142,7 @@ def hosted(at: Place, mount: Mount, row: float, a: float, b: float, rho: float) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sight(landmark: Hosted, at: Place, mount: Mount, cam: Lens) -> Sight:
+def sight(landmark: Hosted, at: Place, mount: Mount, cam: Optics) -> Sight:
     """Carry a landmark into a camera of a body at a place."""
     rho, gap = landmark.rho, minus(landmark.place.p, at.p)
     in_seen = back(at.R, plus(landmark.in_world, times(rho, gap)))
@@ -151,16 +151,16 @@ def sight(landmark: Hosted, at: Place, mount: Mount, cam: Lens) -> Sight:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def residual(in_cam: Vec, rho: float, view: Measured, cam: Lens) -> tuple[bool, Vec]:
-    """Return whether a landmark is in front of the camera, and the view's whitened error: pixel and inverse depth."""
+def residual(in_cam: Vec, rho: float, view: Measured, cam: Optics) -> tuple[bool, Vec]:
+    """Return whether a camera can see a landmark, and the view's whitened error: pixel and inverse depth."""
     x, y, z = in_cam
     if not z > _MIN_Z:
         return False, (0.0, 0.0, 0.0)
-    ex, ey, focal = x / z - view.x, y / z - view.y, cam.focal
+    u, v, _, _, _, _ = imaged(x / z, y / z, cam.lens)
+    if not np.isfinite(u):
+        return False, (0.0, 0.0, 0.0)
     depth = view.depth_weight * (cam.metres * rho / z - view.inverse_depth)
-    white_x = focal * (view.white_xx * ex + view.white_xy * ey + view.off_x) - view.off_x
-    white_y = focal * (view.white_yx * ex + view.white_yy * ey + view.off_y) - view.off_y
-    return True, (white_x, white_y, depth)
+    return True, (view.weight * (cam.focal * u - view.u), view.weight * (cam.focal * v - view.v), depth)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -188,7 +188,7 @@ def linearised(
     huber_k: tuple[float, float],
     J: Array,
 ) -> None:
-    """Fill J [3, 24] with a view's whitened error and its derivative at a sight, robustly weighted.
+    """Fill J [3, 26] with a view's whitened error and its derivative at a sight, robustly weighted.
 
     `same` says that the host itself sees it. From `huber_k` on, of pixels and of depth, errors count less. The third
     row is filled where a depth is measured.
@@ -196,14 +196,14 @@ def linearised(
     z = seen.in_cam[2]
     x, y = seen.in_cam[0] / z, seen.in_cam[1] / z
     weight = np.sqrt(robust(error[0] * error[0] + error[1] * error[1], huber_k[0])[0])
-    cam = seen.cam
-    slope = weight * cam.focal
-    a, b, off = slope * view.white_xx, slope * view.white_xy, weight * view.off_x
+    cam, weighted = seen.cam, weight * view.weight
+    u, v, ux, uy, vx, vy = imaged(x, y, cam.lens)
+    at, a, b = weighted * u, weighted * cam.focal * ux, weighted * cam.focal * uy
     for k in range(3):  # in a loop, for numba would compile the row again for each constant
         if k == 1:
-            a, b, off = slope * view.white_yx, slope * view.white_yy, weight * view.off_y
+            at, a, b = weighted * v, weighted * cam.focal * vx, weighted * cam.focal * vy
         by_cam = (a / z, b / z, -(a * x + b * y) / z)
-        by_lens = ((weight * error[k] + off) / cam.focal, 0.0)
+        by_lens, slope = (at, 0.0), 0.0
         if k == 2:
             if not view.depth_weight > 0.0:
                 break
@@ -221,7 +221,7 @@ def linearised(
 def _row(
     landmark: Hosted, seen: Sight, row: float, same: bool, by_cam: Vec, by_lens: tuple[float, float], J: Array, k: int
 ) -> None:
-    """Carry the derivative by the camera's coordinates back through the frames into row k of J [3, 24].
+    """Carry the derivative by the camera's coordinates back through the frames into row k of J [3, 26].
 
     The whole way depends on rho, for the landmark is scaled by it.
     """

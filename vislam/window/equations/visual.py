@@ -25,10 +25,10 @@ from vislam.window.equations.projection import (
     Mount,
     Place,
     hosted,
-    lenses,
     linearised,
     measured,
     mounted,
+    optics,
     place,
     residual,
     robust,
@@ -46,10 +46,10 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
     """Return half the robust cost of all views; `squares` [N, 2] gets the squared errors of pixel and depth."""
     mount, total = mounted(camera, calibration), 0.0
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
     huber_k = camera.huber_k
     for p in range(len(points)):
-        host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
+        host, rho, row = hosts[p], points[p, 2], values[first[p], 5]
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
         landmark = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
         total += camera.rho_information * rho * rho
@@ -93,13 +93,13 @@ def linearise(
     X, X_first, held = states
     mount, calibrated = mounted(camera, calibration), poses_at + 6 * len(X)
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
     huber_k = camera.huber_k
     J, ours, theirs = np.zeros((3, COLUMNS)), np.empty((POINT + 3, _OWN)), np.empty((6, COLUMNS))
     blocks, gradients, cross = landmarks.blocks, landmarks.gradients, landmarks.cross
     cross[:] = 0.0
     for p in range(len(points)):
-        host, rho, row = hosts[p], points[p, 2], values[first[p], 6]
+        host, rho, row = hosts[p], points[p, 2], values[first[p], 5]
         dt_host = shift(offsets_s, calibration, host, row)
         at_host = at_fixed = place(X, host, rates, dt_host)
         landmark = fixed = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
@@ -190,7 +190,7 @@ def start(
     """
     mount = mounted(camera, calibration)
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
     for p in range(len(points)):
         if not wanted[p]:
             continue
@@ -204,7 +204,7 @@ def start(
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
             at_infinity = sight(far, at, mount, cam).in_cam
             by_rho = minus(sight(near, at, mount, cam).in_cam, at_infinity)
-            weight = view.white_xx**2
+            weight = (view.weight * cam.lens.pinhole[0]) ** 2
             ax, ay = by_rho[0] - view.x * by_rho[2], by_rho[1] - view.y * by_rho[2]
             numerator -= weight * ax * (at_infinity[0] - view.x * at_infinity[2])
             numerator -= weight * ay * (at_infinity[1] - view.y * at_infinity[2])
@@ -223,9 +223,9 @@ def _refine(
 ) -> None:
     """Move landmark p [3] by three Gauss-Newton steps with the poses fixed."""
     first, hosts, keyframes, cameras, values = views
-    cams, rates, offsets_s = lenses(camera.T_cam0_cams, calibration), camera.rate, camera.applied_offset_s
+    cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
     huber_k = camera.huber_k
-    host, row, J = hosts[p], values[first[p], 6], np.zeros((3, COLUMNS))
+    host, row, J = hosts[p], values[first[p], 5], np.zeros((3, COLUMNS))
     H, b, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(3):
         for i in range(3):
