@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from vislam.cli import run_verb
 from vislam.config import CalibrationConfig, Config, load
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import Camera, CameraSigmas, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import se3_exp
 from vislam.core.messages import ImuSample, MagSample
@@ -85,6 +85,16 @@ def test_kalibr_chains_read_back(camera: Camera, T: np.ndarray, offset_s: float 
     assert first.T_body_cam == pytest.approx(T, abs=1e-9) and other.T_body_cam == pytest.approx(T @ T, abs=1e-9)
     alone = read_cameras(written(camchain_text([CameraCalibration(camera)], "")))[0]
     assert alone.camera == camera and alone.T_body_cam is None and alone.time_offset_s is None
+
+
+def test_how_well_a_camera_is_known_reads_back_and_has_a_default() -> None:
+    known = replace(CAMERA, sigmas=CameraSigmas(0.001, 0.0, 0.01))
+    for text in (camchain_text([CameraCalibration(known)], ""), camera_text(known, None, "c")):
+        assert read_cameras(written(text))[0].camera == known
+        silent = "".join(line for line in text.splitlines(keepends=True) if "_sigma" not in line)
+        assert read_cameras(written(silent))[0].camera == CAMERA
+        with pytest.raises(DataError, match="focal_sigma"):
+            read_cameras(written(text.replace("focal_sigma: 0.001", "focal_sigma: -1")))
 
 
 @given(cameras, st.none() | poses)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from vislam.core.camera import Rig
-from vislam.core.geometry import invert, quaternion_wxyz, so3_log
+from vislam.core.geometry import invert, quaternion_wxyz, so3_log, transform
 from vislam.core.messages import Array, Observations
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.stretch import Stretch
@@ -115,6 +115,34 @@ def test_derivatives_of_a_track(rig: Rig, readout_s: float) -> None:
         step = h * np.eye(3)[j]
         ahead, behind = (residuals(window, rig, at, seen, POINT + s * step) for s in (1, -1))
         np.testing.assert_allclose(H_f[:, j], -(ahead - behind) / (2 * h), rtol=2e-5, atol=2e-4)
+
+
+def test_noise_of_pixels_does_not_move_the_focal_length() -> None:
+    """With known poses, what tracks of a distorted camera say of it has no mean; with J at measured pixels 6 sigmas."""
+    window, _ = a_window(Motion.random(5))
+    rng, camera, clones = np.random.default_rng(1), MONO.cameras[0], len(window.frames)
+    T_cams = [transform(R, p) @ MONO.T_body_cams[0] for R, p in zip(window.R, window.p, strict=True)]
+    rays = camera.unproject(rng.uniform((40.0, 40.0), (710.0, 440.0), (6000, 2)))
+    points = (rays * rng.uniform(2.0, 6.0, (6000, 1))) @ T_cams[1][:3, :3].T + T_cams[1][:3, 3]
+    pixels = np.array([camera.project((points - T[:3, 3]) @ T[:3, :3]) for T in T_cams])
+    whole = np.flatnonzero(np.all([camera.contains(np.nan_to_num(seen, nan=-1.0), 5.0) for seen in pixels], axis=0))
+    noisy = pixels[:, whole] + SIGMAS[0] * rng.normal(size=(clones, len(whole), 2))
+    rows = np.stack([prepare(0, Observations(whole, seen), MONO, 0.0).seen for seen in noisy])
+    R_body_cam, p_body_cam, R10, t10 = rig_parts(MONO)
+    at, gradient, information = np.arange(clones), 0.0, 0.0
+    poses = features.camera_poses(
+        at, rows[:, 0], window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam
+    )
+    for k in range(len(whole)):
+        views, given = Views(at, np.ascontiguousarray(rows[:, k]), *poses), sensor(MONO, SIGMAS, R10, t10)
+        point, _, _ = features.triangulate(views, given)
+        A, H_f, _ = features.linearise(point, views, given, clones)
+        features.project_out(A, H_f)
+        gradient += float(A[3:, 3] @ A[3:, -1])
+        information += float(A[3:, 3] @ A[3:, 3])
+    print(f"{len(whole)} tracks, {gradient / np.sqrt(information):.2f} sigmas, {100 / np.sqrt(information):.3f} %")
+    assert len(whole) > 1000
+    assert abs(gradient) < 3.0 * np.sqrt(information)
 
 
 @pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])

@@ -16,7 +16,7 @@ from vislam.core.camera import Camera, Distortion
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
-from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_camera, read_pose
+from vislam.datasets.calibration import SIGMA_KEYS, list_text, load_yaml, numbers_in, parse_camera, read_pose
 
 _MAX_CAMERAS = 2
 _RATIONAL = "rational_polynomial"
@@ -62,7 +62,7 @@ def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
 
 
 def camchain_text(cameras: Sequence[CameraCalibration], comment: str) -> str:
-    """Return Kalibr's camchain.yaml; our keys `skew_px` and `timeshift_cam_imu_sigma` stand in it only where needed."""
+    """Return Kalibr's camchain.yaml; our keys are `skew_px`, `timeshift_cam_imu_sigma`, `focal_sigma` and its like."""
     return f"# {' '.join(comment.split())}\n" + "".join(_chain_entry(k, found) for k, found in enumerate(cameras))
 
 
@@ -97,6 +97,7 @@ def _chain_entry(index: int, found: CameraCalibration) -> str:
     ]
     if camera.skew_px != 0.0:
         lines.append(f"  skew_px: {float(camera.skew_px)!r}")
+    lines += [f"  {name}: {float(getattr(camera.sigmas, key))!r}" for key, name in SIGMA_KEYS.items()]
     if found.time_offset_s is not None:
         lines.append(f"  timeshift_cam_imu: {float(found.time_offset_s)!r}  # s, t_imu = t_cam + shift")
     if found.time_offset_sigma_s is not None:

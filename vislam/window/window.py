@@ -113,7 +113,7 @@ class SlidingWindow:
     def _clear(self) -> None:
         self._full = self._start is not None and self._start.state is not None  # with velocities and biases
         self._keyframes = Keyframes()
-        self._calibration = self._new_calibration(0.0)
+        self._calibration = Calibration(self._config, self._rig, self._noise if self._full else None, 0.0)
         self._doubt = Doubt()
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
@@ -122,9 +122,6 @@ class SlidingWindow:
         self._speed_sigma_m_s = 0.0
         self._last_edges: list[WindowEdge] = []
         self._sure = self._at_rest = False
-
-    def _new_calibration(self, time_offset_s: float) -> Calibration:
-        return Calibration(self._config, self._rig, self._noise if self._full else None, time_offset_s)
 
     # ---- what comes in
 
@@ -142,7 +139,8 @@ class SlidingWindow:
     def _first_state(self, packet: KeyframePacket) -> Array:
         """Return the state of the first keyframe, and set the prior on it."""
         assert self._start is not None
-        self._calibration = self._new_calibration(packet.time_offset_s)
+        noise = self._noise if self._full else None
+        self._calibration = Calibration(self._config, self._rig, noise, packet.time_offset_s)
         x, self._prior = self._start.equations(self._calibration)
         if self._start.state is not None:
             self._speed_sigma_m_s = float(np.sqrt(np.diag(self._start.state.covariance)[6:9].max()))

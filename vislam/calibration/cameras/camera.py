@@ -16,6 +16,7 @@ from vislam.calibration.options import CameraOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.config import WebcamConfig
 from vislam.core.angles import angle_deg
+from vislam.core.camera import CameraSigmas
 from vislam.core.messages import Array
 from vislam.datasets.calibration import camera_text
 from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text
@@ -46,7 +47,8 @@ def calibrate_camera(options: CameraOptions) -> Outcome:
     folder = Folder(options.out, _FILES, options.overwrite)
     found = _look(options)
     result = solve_camera(found, options)
-    camera, report = result.fit.camera, _report(result, options)
+    sigmas = replace(CameraSigmas(), focal=_focal_sigma(result.fit))
+    camera, report = replace(result.fit.camera, sigmas=sigmas), _report(result, options)
     comment = (
         f"{len(result.views)} views, rms {result.fit.rms_px:.2f} px, "
         f"focal length to {_focal_sigma(result.fit):.2%} (1 sigma)"
