@@ -38,9 +38,7 @@ class Preintegrated:
     dv_daccel: Array  # [3, 3]
     dp_dgyro: Array  # [3, 3]
     dp_daccel: Array  # [3, 3]
-    by_axes: (
-        Array  # [9, 6] of rotation, velocity, position by relative errors of the axes of gyroscope and accelerometer
-    )
+    by_axes: Array  # [9, 6] of rotation, velocity, position by relative errors of gyroscope's and accelerometer's axes
     covariance: Array  # [9, 9]; zero without a noise model
     gyro_bias_rad_s: Array  # [3], the biases that were taken off
     accel_bias_m_s2: Array  # [3]

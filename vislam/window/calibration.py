@@ -9,6 +9,7 @@ from vislam.config import WindowConfig
 from vislam.core.camera import Rig
 from vislam.core.messages import Array
 from vislam.imu import ImuNoise
+from vislam.window.equations import CALIBRATION
 from vislam.window.messages import CalibrationEstimate
 
 _MAX_OFFSET_S = 0.1  # a residual time offset beyond this is a wrong clock, not a late camera
@@ -22,7 +23,7 @@ class Calibration:
 
     def __init__(self, config: WindowConfig, rig: Rig, noise: ImuNoise | None, time_offset_s: float) -> None:
         """Start at the time offset that the first keyframe's stamp contains; `noise` None: of poses alone."""
-        switches = np.ones(16, dtype=np.bool_)
+        switches = np.ones(CALIBRATION, dtype=np.bool_)
         switches[:5] = config.estimate_time_offset, *[config.estimate_rotation] * 3, config.estimate_readout
         first, second = rig.cameras[0].sigmas, rig.cameras[1].sigmas if rig.is_stereo else None
         axes = (0.0, 0.0) if noise is None else (noise.gyroscope_scale_sigma, noise.accelerometer_scale_sigma)
@@ -33,7 +34,7 @@ class Calibration:
         ])  # fmt: skip
         self.wanted: NDArray[np.bool_] = switches & (sigmas > 0.0) & (noise is not None)
         self.start_sigmas: Array = self.wanted * sigmas
-        self.values: Array = np.zeros(16)
+        self.values: Array = np.zeros(CALIBRATION)
         self.values[0], self.values[4] = time_offset_s, config.readout_s or 0.0
 
     def take(self, values: Array, applied_s: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import MachineConfig, WindowConfig
-from vislam.core.geometry import transform
+from vislam.core.geometry import so3_exp, transform
 from vislam.core.messages import Array, ImuSpan
 from vislam.core.readings import Motion
 from vislam.imu import ImuNoise, Preintegrated, preintegrate
@@ -100,14 +100,18 @@ class LinkStore:
             links.rest_weight[k + 1] = 1.0 / machine.rest_speed_sigma_m_s
         return inertial
 
-    def carried(self, x: Array) -> Array:
-        """Return the state [21] that the newest link, an inertial one, predicts from the state x [21] before it."""
+    def carried(self, x: Array, axes: Array) -> Array:
+        """Return the state [21] that the newest link, an inertial one, predicts from the state x [21] before it.
+
+        `axes` [6] are the relative errors of the axes.
+        """
         links, k = self.arrays, len(self) - 1
         out, R, dt_s = x.copy(), x[:9].reshape(3, 3), float(links.dt[k])
         fall = np.array([0.0, 0.0, -self.gravity_m_s2])
-        out[:9] = (R @ links.dR[k]).ravel()
-        out[9:12] += dt_s * x[12:15] + 0.5 * dt_s**2 * fall + R @ links.dp[k]
-        out[12:15] += dt_s * fall + R @ links.dv[k]
+        turn, dv, dp = np.split(links.by_imu[k, :, 6:] @ axes, 3)
+        out[:9] = (R @ links.dR[k] @ so3_exp(turn)).ravel()
+        out[9:12] += dt_s * x[12:15] + 0.5 * dt_s**2 * fall + R @ (links.dp[k] + dp)
+        out[12:15] += dt_s * fall + R @ (links.dv[k] + dv)
         return out
 
     def integrate(self, k: int, bias: Array) -> None:

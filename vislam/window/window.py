@@ -22,6 +22,7 @@ from vislam.window import gate
 from vislam.window.calibration import Calibration
 from vislam.window.doubt import Doubt
 from vislam.window.equations import (
+    AXES,
     Camera,
     Leaving,
     Prior,
@@ -156,7 +157,7 @@ class SlidingWindow:
         span = packet.imu if self._full else None
         inertial = self._links.push(span, dt_s, last[15:].copy(), motion, packet.at_rest and self._full, motions)
         if inertial and (by_odometry is None or self._speed_sigma_m_s <= _UNKNOWN_SPEED_M_S):
-            return self._links.carried(last)
+            return self._links.carried(last, self._calibration.values[AXES:])
         x, R = last.copy(), last[:9].reshape(3, 3)
         x[:9] = (R @ motion[:3, :3]).ravel()
         x[9:12] += R @ motion[:3, 3]

@@ -8,7 +8,7 @@ holds are linearised where it was, and a bad system is a value, not an exception
 factors can do that.
 """
 
-from vislam.window.equations.layout import CALIBRATION, STATE, Camera, Ints, Links, Normal, Prior, States, Views
+from vislam.window.equations.layout import AXES, CALIBRATION, STATE, Camera, Ints, Links, Normal, Prior, States, Views
 from vislam.window.equations.linear import joint_covariance, trailing_covariance
 from vislam.window.equations.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
 from vislam.window.equations.projection import (
@@ -37,6 +37,7 @@ from vislam.window.equations.schur import invert
 from vislam.window.equations.solver import Problem, Room, Solution, optimise
 
 __all__ = [
+    "AXES",
     "CALIBRATED",
     "CALIBRATION",
     "COLUMNS",
