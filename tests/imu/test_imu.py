@@ -1,5 +1,7 @@
 """Inertial data: buffer, preintegration, calibration, rest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -119,6 +121,14 @@ def test_preintegration_jacobians() -> None:
         plus, minus = preintegrate(span, gyro_bias, accel_bias + d), preintegrate(span, gyro_bias, accel_bias - d)
         np.testing.assert_allclose(piece.dv_daccel[:, axis], (plus.dv_m_s - minus.dv_m_s) / (2 * step), atol=1e-7)
         np.testing.assert_allclose(piece.dp_daccel[:, axis], (plus.dp_m - minus.dp_m) / (2 * step), atol=1e-7)
+    bias = np.concatenate((gyro_bias, accel_bias))
+    for axis in range(6):  # of an axis that shows `1 + s` times the truth
+        ends = []
+        for s in (step, -step):
+            true = (np.column_stack((span.gyro_rad_s, span.accel_m_s2)) - bias) / (1.0 + s * np.eye(6)[axis]) + bias
+            other = preintegrate(replace(span, gyro_rad_s=true[:, :3], accel_m_s2=true[:, 3:]), gyro_bias, accel_bias)
+            ends.append(np.concatenate((so3_log(piece.dR.T @ other.dR), other.dv_m_s, other.dp_m)))
+        np.testing.assert_allclose(piece.by_axes[:, axis], (ends[0] - ends[1]) / (2 * step), atol=2e-6)
 
 
 def test_first_order_correction_follows_reintegration() -> None:
