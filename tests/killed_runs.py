@@ -1,11 +1,13 @@
 """Kills a run again and again with SIGKILL at random moments and resumes it; `python killed_runs.py FOLDER SEED KILLS`.
 
-Runs are forked from one process that has compiled everything, so that each starts within milliseconds and moments of
-the pipeline are hit, not those of importing. Every line on stdout is a fact as JSON; a failed check ends it.
+A moment is one at which a run opens, renames or removes a file or begins an SQL statement: there what is stored
+changes, and counted in them, not in seconds, the same seed kills at the same places on any machine. Runs are forked
+from one process that has compiled everything. Every line on stdout is a fact as JSON; a failed check ends it.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import random
@@ -13,9 +15,9 @@ import shutil
 import signal
 import sqlite3
 import sys
-import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 from vislam import slam
 from vislam.cli import run_verb
@@ -24,23 +26,27 @@ from vislam.runs.session import Session
 SOURCE = "points:corridor-loop,duration_s=12,camera_hz=10,tracks=100"
 SETTINGS = ("--view.no-enabled", "--json")
 DONE = (0, 2)  # 2: all but the report had been written, and there was nothing to resume
-MOST = 4  # keyframes that a run sees before it is killed; the longest wait after the last of them:
-WITHIN_S = 0.2
+MOMENTS = 400  # a run sees at most so many before it is killed
+CHANGES = ("open", "os.rename", "os.remove", "shutil.rmtree")
 
 
-def start(arguments: list[str], begun: int) -> int:
-    """Fork a run; it writes a byte to the pipe `begun` for each keyframe that reaches its back end."""
-    child = os.fork()
-    if child:
-        return child
+def run_until(moment: int, arguments: list[str], begun: int) -> None:
+    """Run until killed at a moment; a byte is written to `begun` for each keyframe that reaches the back end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    add = slam.Back.add
+    add, connect, moments = slam.Back.add, sqlite3.connect, itertools.count()
 
-    def told(self: slam.Back, *arguments: object) -> object:
-        os.write(begun, b".")
-        return add(self, *arguments)
+    def pass_moment(*_: object) -> None:
+        if next(moments) == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-    slam.Back.add = told
+    def traced(*arguments: Any, **settings: Any) -> sqlite3.Connection:
+        db = connect(*arguments, **settings)
+        db.set_trace_callback(pass_moment)
+        return db
+
+    slam.Back.add = lambda *arguments: (os.write(begun, b"."), add(*arguments))[1]
+    sqlite3.connect = traced
+    sys.addaudithook(lambda event, _: pass_moment() if event in CHANGES else None)
     os._exit(run_verb(arguments))
 
 
@@ -68,28 +74,26 @@ def committed(session: Path, scratch: Path) -> int:
     with closing(Session(copy)) as session_copy:
         log = session_copy.factor_log()
         assert len(log.keyframes) == counts["keyframes"]
-        newest = log.keyframes[-1].packet.keyframe.t_ns if log.keyframes else 0
-        assert not log.keyframes or newest in log.frames.t_ns
+        assert not log.keyframes or log.keyframes[-1].packet.keyframe.t_ns in log.frames.t_ns
     return counts["keyframes"]
 
 
-def killed(arguments: list[str], out: Path, before: int, keyframes: int, delay_s: float) -> dict[str, object]:
-    """Start or resume a run, kill it a while after some keyframes, and return what is left of it."""
+def killed(arguments: list[str], out: Path, before: int, moment: int) -> dict[str, object]:
+    """Start or resume a run that is killed at a moment, and return what is left of it."""
     read, write = os.pipe()
-    child = start(arguments, write)
+    child = os.fork()
+    if not child:
+        run_until(moment, arguments, write)
     os.close(write)
-    with os.fdopen(read, "rb", buffering=0) as pipe:
-        begun = sum(len(pipe.read(1)) for _ in range(keyframes))  # nothing comes of a run that has ended
-        time.sleep(delay_s)
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-        begun += len(pipe.read())
+    with os.fdopen(read, "rb") as pipe:
+        begun = len(pipe.read())
+    _, status = os.waitpid(child, 0)
     ended = os.WIFEXITED(status)
     assert not ended or os.WEXITSTATUS(status) in DONE, f"{arguments} ended with {os.WEXITSTATUS(status)}"
     left = committed(out / "session.db", out.parent / "scratch")
-    first_group = before == 0  # keyframes that waited for gravity come together
-    assert left >= (before if first_group else before + begun - 1), f"{before} + {begun} keyframes, {left} are left"
-    return {"keyframes": keyframes, "delay_s": delay_s, "begun": begun, "left": left, "ended": ended}
+    lost = 1 if before else begun  # those that waited for gravity come together
+    assert left >= before + begun - lost, f"{before} + {begun} keyframes, {left} are left"
+    return {"moment": moment, "begun": begun, "left": left, "ended": ended}
 
 
 def main(folder: Path, seed: int, kills: int) -> None:
@@ -102,7 +106,7 @@ def main(folder: Path, seed: int, kills: int) -> None:
         arguments = ["run", "--resume", str(out), "--json"] if begun else ["run", SOURCE, "--out", str(out), *SETTINGS]
         if not begun:
             shutil.rmtree(out, ignore_errors=True)
-        fact = killed(arguments, out, left, rng.randint(0, MOST), rng.uniform(0.0, WITHIN_S))
+        fact = killed(arguments, out, left, rng.randint(0, MOMENTS))
         left = int(str(fact["left"]))
         if fact["ended"]:
             number, left = number + 1, 0
