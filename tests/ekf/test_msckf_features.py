@@ -81,7 +81,7 @@ def seen_from(
 
 
 def sensor(rig: Rig, sigmas: Array, R10: Array, t10: Array, focal: float = 1.0, metres: float = 1.0) -> Sensor:
-    return Sensor(rig.cameras[0].lens, rig.cameras[-1].lens, sigmas, R10, t10, focal, metres)
+    return Sensor(*rig.lenses, sigmas, R10, t10, focal, metres)
 
 
 def residuals(window: Window, rig: Rig, at: NDArray[np.int64], seen: Array, point: Array) -> Array:
@@ -89,7 +89,7 @@ def residuals(window: Window, rig: Rig, at: NDArray[np.int64], seen: Array, poin
     R_body_cam = np.ascontiguousarray(window.R_body_cam)
     poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
     A, _, _ = features.linearise(
-        point, Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10, *window.lens), len(window.frames)
+        point, Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10, *window.scales), len(window.frames)
     )
     return A[:, -1]
 
@@ -118,7 +118,7 @@ def test_derivatives_of_a_track(rig: Rig, readout_s: float) -> None:
 
 
 def test_noise_of_pixels_does_not_move_the_focal_length() -> None:
-    """With known poses, what tracks of a distorted camera say of it has no mean; with J at measured pixels 6 sigmas."""
+    """With known poses, what tracks of a distorted camera say of it has no mean: their noise stays out of J."""
     window, _ = a_window(Motion.random(5))
     rng, camera, clones = np.random.default_rng(1), MONO.cameras[0], len(window.frames)
     T_cams = [transform(R, p) @ MONO.T_body_cams[0] for R, p in zip(window.R, window.p, strict=True)]

@@ -63,7 +63,7 @@ def make_scene(rig, seed: int) -> Scene:
     camera = Camera(
         T_body_cam=rig.T_body_cams[0],
         T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams]),
-        lenses=(rig.cameras[0].lens, rig.cameras[-1].lens),
+        lenses=rig.lenses,
         rate=rng.normal(size=(count, 3)),
         applied_offset_s=rng.normal(size=count) * 1e-3,
         active=np.ones(CALIBRATION, dtype=np.bool_),

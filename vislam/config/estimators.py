@@ -98,7 +98,7 @@ class GraphConfig:
     window_refresh_max: Whole = 3  # ... up to so many per keyframe, those that moved most
     gravity_every: Count = 10  # keyframes between tilt factors; errors of nearer ones are the same accelerometer bias
     edges_share_scale: bool = False  # of a window: set by the run, for one camera whose scale is the IMU's
-    tilt_floor_deg: NonNegative = 0.1  # an accelerometer's scale and misalignment, which the window does not estimate
+    tilt_floor_deg: NonNegative = 0.1  # an accelerometer's misalignment, which the window does not estimate
     huber_k: Positive = 3.5  # whitened norm; the 95 % point of 6 degrees of freedom
     imu_integration_sigma: NonNegative = 1e-4  # m/sqrt(s), what sampling at finite rate leaves
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.jit import njit
-from vislam.core.lens import Lens, distort
+from vislam.core.lens import Lens, distort, imaged
 from vislam.core.messages import Array
 
 MapF32 = NDArray[np.float32]
@@ -32,19 +32,14 @@ _NO_COEFFICIENT = 1e-12  # of a polynomial in r^2: what it changes at any radius
 
 
 @njit(cache=True, nogil=True)
-def _project(points: Array, pinhole: Array, model: int, k: Array, max_r2: float) -> Array:
+def _project(points: Array, lens: Lens) -> Array:
     out = np.full((len(points), 2), np.nan)
-    fx, fy, cx, cy, skew = pinhole
     for i in range(len(points)):
         z = points[i, 2]
         if not z > _MIN_Z_M:
             continue
-        x, y = points[i, 0] / z, points[i, 1] / z
-        if not x * x + y * y <= max_r2:  # NaN too
-            continue
-        u, v, _, _, _, _ = distort(x, y, model, k)
-        out[i, 0] = fx * u + skew * v + cx
-        out[i, 1] = fy * v + cy
+        u, v, _, _, _, _ = imaged(points[i, 0] / z, points[i, 1] / z, lens)
+        out[i, 0], out[i, 1] = u + lens.pinhole[2], v + lens.pinhole[3]
     return out
 
 
@@ -211,7 +206,7 @@ class Camera:
 
     def project(self, points_cam_m: Array) -> Array:
         """Return raw pixels [N, 2] of points [N, 3] in the camera frame; NaN behind the camera or beyond the model."""
-        return _project(_rows(points_cam_m, 3), self._pinhole, self._model, self._k, self._max_r2)
+        return _project(_rows(points_cam_m, 3), self.lens)
 
     def project_jacobian(self, points_cam_m: Array) -> Array:
         """Return d(pixel)/d(point) [N, 2, 3] at points [N, 3] in the camera frame; NaN behind the camera."""
@@ -313,6 +308,11 @@ class Rig:
     def T_body_cam0(self) -> Array:
         """Pose [4, 4] of the first camera in the body; the identity without one."""
         return self.T_body_cams[0] if self.cameras else np.eye(4)
+
+    @property
+    def lenses(self) -> tuple[Lens, Lens]:
+        """The first two cameras as compiled code takes them; one camera stands for both."""
+        return self.cameras[0].lens, self.cameras[:2][-1].lens
 
     @property
     def metres_sigma(self) -> float:

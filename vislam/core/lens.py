@@ -22,16 +22,9 @@ class Lens(NamedTuple):
 @njit(cache=True, nogil=True)
 def distort(x: float, y: float, model: int, k: Array) -> tuple[float, float, float, float, float, float]:
     """Return the distorted point and its Jacobian (du/dx, du/dy, dv/dx, dv/dy) on the plane z = 1."""
+    if model == 0:
+        return x, y, 1.0, 0.0, 0.0, 1.0
     r2 = x * x + y * y
-    if model == 1:
-        radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-        slope = 2.0 * (k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2))
-        u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
-        v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
-        ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
-        uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
-        vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
-        return u, v, ux, uy, uy, vy
     if model == 2:
         r = np.sqrt(r2)
         if r < 1e-9:
@@ -44,22 +37,20 @@ def distort(x: float, y: float, model: int, k: Array) -> tuple[float, float, flo
         # d(scale)/dr divided by r, so that multiplying by x and y gives the gradient of scale
         change = (slope / (1.0 + r2) - scale) / r2
         return x * scale, y * scale, scale + change * x * x, change * x * y, change * x * y, scale + change * y * y
+    radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    slope = 2.0 * (k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2))
     if model == 3:
-        over = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
         under = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
         if not under > 0.0:  # at a pole, which lies beyond what the model can see
             return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
-        radial = over / under
-        over_slope = k[0] + r2 * (2.0 * k[1] + 3.0 * k[4] * r2)
-        under_slope = k[5] + r2 * (2.0 * k[6] + 3.0 * k[7] * r2)
-        slope = 2.0 * (over_slope - radial * under_slope) / under
-        u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
-        v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
-        ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
-        uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
-        vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
-        return u, v, ux, uy, uy, vy
-    return x, y, 1.0, 0.0, 0.0, 1.0
+        radial /= under
+        slope = (slope - 2.0 * radial * (k[5] + r2 * (2.0 * k[6] + 3.0 * k[7] * r2))) / under
+    u = x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x)
+    v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y
+    ux = radial + slope * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x
+    uy = slope * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y
+    vy = radial + slope * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x
+    return u, v, ux, uy, uy, vy
 
 
 @njit(cache=True, nogil=True)

@@ -222,8 +222,8 @@ class PoseGraph:
     def states(self) -> list[NavState]:
         """Return the state of each keyframe with its marginal covariance, NaN where gtsam cannot give one.
 
-        An error of scale that all measurements share is in it. As a variable it would keep its prior, for nothing here
-        knows metres better than a floor or a baseline, and would tie all factors to one; considered, it costs nothing.
+        An error of scale that all measurements share is in it, as the window still doubts it or by its prior. As a
+        variable it would keep that, for nothing here knows metres better, and would tie all factors to one.
         """
         states = [self._source.state(one.id, one.t_ns, self._estimator) for one in self._keyframes]
         return [_stretched(state, self._estimator.poses[0], self._source.scale_sigma) for state in states]

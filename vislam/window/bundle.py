@@ -161,7 +161,7 @@ def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig, active: NDAr
     return Camera(
         T_body_cam=rig.T_body_cams[0],
         T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]]),
-        lenses=(rig.cameras[0].lens, rig.cameras[:2][-1].lens),
+        lenses=rig.lenses,
         rate=np.zeros((count, 3)) if problem.rate_rad_s is None else problem.rate_rad_s,
         applied_offset_s=np.zeros(count),
         active=active,

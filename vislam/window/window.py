@@ -173,7 +173,7 @@ class SlidingWindow:
         return Camera(
             T_body_cam=self._rig.T_body_cams[0],
             T_cam0_cams=self._T_cam0_cams,
-            lenses=(self._rig.cameras[0].lens, self._rig.cameras[: len(self._T_cam0_cams)][-1].lens),
+            lenses=self._rig.lenses,
             rate=keyframes.rate_rad_s,
             applied_offset_s=keyframes.applied_offset_s if active[0] else still,
             active=active,

@@ -116,7 +116,7 @@ class TightCore:
         self._gravity = gravity_m_s2
         self._told_sigmas = imu_sigmas(config, noise)
         self._frames, self._known = FrameUpdater(config, gravity_m_s2, rig), KnownUpdater(config, noise)
-        self._lens_sigmas = rig.cameras[0].sigmas.focal, rig.metres_sigma
+        self._scale_sigmas = rig.cameras[0].sigmas.focal, rig.metres_sigma
         self.R_configured = np.ascontiguousarray(rig.T_body_cams[0][:3, :3], dtype=np.float64)
 
     def blank(self) -> TightState:
@@ -136,7 +136,7 @@ class TightCore:
             P[TIME, TIME] = config.tight_time_offset_sigma_s**2
         if config.tight_extrinsic_rotation:
             P[MOUNT, MOUNT] = np.eye(3) * np.deg2rad(config.tight_extrinsic_sigma_deg) ** 2
-        P[FOCAL, FOCAL], P[METRES, METRES] = np.square(self._lens_sigmas)
+        P[FOCAL, FOCAL], P[METRES, METRES] = np.square(self._scale_sigmas)
         time_offset_s, R_body_cam = 0.0, self.R_configured
         if camera is not None:
             P[TIME, TIME] = camera.time_offset_sigma_s**2

@@ -66,7 +66,7 @@ class Window:
     rested_t_ns: int = 0  # stamp of the newest frame at which it still rested
     # [2] of tracks and of points, by how much whitened rows scatter as they turn out, at most 1
     spread: Array = field(default_factory=lambda: np.ones(2))
-    lens: Array = field(default_factory=lambda: np.ones(2))  # true focal length and metres over those given
+    scales: Array = field(default_factory=lambda: np.ones(2))  # true focal length and metres over those given
     rejects: int = 0  # frames in a row whose tracks contradict the state
     rejects_since_ns: int = 0
     last_vision_t_ns: int = 0
@@ -297,7 +297,7 @@ def moved(window: Window, x: Array, change: Array) -> Window:
         window,
         time_offset_s=window.time_offset_s + float(change[TIME]),
         R_body_cam=window.R_body_cam @ so3_exp(np.ascontiguousarray(change[MOUNT])),
-        lens=window.lens + change[FOCAL : METRES + 1],
+        scales=window.scales + change[FOCAL : METRES + 1],
         R=R,
         p=p,
         velocity=velocity,

@@ -105,8 +105,7 @@ class FrameUpdater:
         T_cam1_cam0 = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
         sigmas = np.array([config.tight_pixel_sigma_px, _STEREO_SIGMA_PX, _DEPTH_SIGMA_RHO])
         into_right = np.ascontiguousarray(T_cam1_cam0[:3, :3]), np.ascontiguousarray(T_cam1_cam0[:3, 3])
-        lenses = rig.cameras[0].lens, rig.cameras[:2][-1].lens
-        self._sensor = features.Sensor(*lenses, sigmas, *into_right)
+        self._sensor = features.Sensor(*rig.lenses, sigmas, *into_right)
         self._point_sensor = self._sensor._replace(sigmas=sigmas * np.array([config.tight_point_inflation, 1.0, 1.0]))
         self._bounds = features.Bounds(
             min_rho=1.0 / _MAX_RANGE_M,
@@ -314,7 +313,7 @@ class FrameUpdater:
 
 def _as_found(sensor: features.Sensor, window: Window, which: int) -> features.Sensor:
     """Return a sensor as the window has it, with the spread of tracks (0) or points (1)."""
-    focal, metres = window.lens.tolist()
+    focal, metres = window.scales.tolist()
     return sensor._replace(focal=focal, metres=metres, spread=float(window.spread[which]))
 
 

@@ -3,9 +3,8 @@
 Compiled by hand: 580 lines, and 130 of `window.gate`. Peer: gtsam's `IncrementalFixedLagSmoother`. With smart factors
 it is faster: this takes 1.2 to 1.7 times as long; with landmarks as unknowns gtsam takes 1.1 to 1.4 times as long.
 Errors of position are 0 to 13 % smaller than with smart factors (benchmarks/RESULTS.md). What the time is paid for:
-time offset, rotation of the camera and readout of a rolling shutter are estimated with the rest, states that the prior
-holds are linearised where it was, and a bad system is a value, not an exception. To be dropped when gtsam's smart
-factors can do that.
+calibration of cameras and IMU is estimated with the rest, states that the prior holds are linearised where it was, and
+a bad system is a value, not an exception. To be dropped when gtsam's smart factors can do that.
 """
 
 from vislam.window.equations.layout import AXES, CALIBRATION, STATE, Camera, Ints, Links, Normal, Prior, States, Views

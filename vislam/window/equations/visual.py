@@ -83,7 +83,7 @@ def linearise(
     Args:
         states: of M keyframes.
         points: bearing and inverse depth [L, 3].
-        calibration: [5].
+        calibration: [16].
         views: observations.
         camera: geometry and timing.
         poses_at: where the poses begin among the unknowns; calibration follows them.
