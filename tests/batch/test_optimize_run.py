@@ -7,6 +7,7 @@ import pytest
 
 from vislam.batch import optimize_run
 from vislam.config import BatchConfig, Config
+from vislam.core.camera import EXACT, CameraSigmas, Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_exp, so3_log, transform
 from vislam.core.messages import ImuSpan, NavState, Observations, Tracking, VoMeasurement
@@ -221,3 +222,38 @@ def test_frames_between_keyframes_follow_the_imu():
 def _without_middle(span):
     keep = np.abs(np.arange(len(span.t_ns)) - len(span.t_ns) / 2) > 12
     return ImuSpan(span.t_ns[keep], span.gyro_rad_s[keep], span.accel_m_s2[keep])
+
+
+def with_cameras(log, focal, metres, sigmas):
+    """The log of a run whose calibration gives so many times the true focal length and baseline."""
+    cameras = tuple(replace(camera.with_focal(focal), sigmas=sigmas) for camera in log.rig.cameras)
+    first, *others = log.rig.T_body_cams
+    apart = [invert(first) @ T for T in others]
+    T_body_cams = (first, *(first @ transform(T[:3, :3], metres * T[:3, 3]) for T in apart))
+    return replace(log, rig=Rig(cameras, T_body_cams, log.rig.has_depth))
+
+
+@pytest.mark.parametrize(("kind", "focal", "metres"), [("mono", 0.99, 1.0), ("stereo", 1.01, 0.98)])
+def test_what_a_calibration_is_off_by_is_found(kind, focal, metres):
+    run = simulate(kind, true_loops=0)
+    exact, found = (
+        optimize_run(with_cameras(run.log, focal, metres, sigmas), CONFIG)
+        for sigmas in (EXACT, CameraSigmas(0.01, 0.02))
+    )
+    wrong_m, right_m = run.rmse_m(exact.T_map_body), run.rmse_m(found.T_map_body)
+    print(f"{wrong_m:.4f} m, {right_m:.4f} m", found.calibration)
+    assert right_m < 0.6 * wrong_m
+    errors, sigmas = found.calibration
+    assert np.all(np.abs(np.array([1.0 / focal, 1.0 / metres]) - 1.0 - errors) < 3.0 * sigmas + 1e-9)
+    assert np.array_equal(exact.calibration, np.zeros((2, 2)))
+
+
+def test_without_an_imu_the_unit_of_metres_stays_in_doubt():
+    run = simulate("rgbd", imu=False, true_loops=0)
+    sure, unsure = (
+        optimize_run(with_cameras(run.log, 1.0, 1.0, sigmas), CONFIG) for sigmas in (EXACT, CameraSigmas(0.0, 0.01))
+    )
+    assert np.allclose(unsure.calibration, [[0.0, 0.0], [0.0, 0.01]])
+    way = unsure.T_map_body[-1, :3, 3] - unsure.T_map_body[0, :3, 3]
+    added = (unsure.states[-1].covariance - sure.states[-1].covariance)[3:6, 3:6]
+    assert np.allclose(added, np.outer(way, way) * 1e-4, atol=0.05 * way @ way * 1e-4)

@@ -164,6 +164,10 @@ class Camera:
         if len(self.coefficients) not in allowed:
             raise DataError(f"{self.distortion} distortion takes {allowed} coefficients, got {len(self.coefficients)}")
 
+    def with_focal(self, factor: float) -> Camera:
+        """Return the camera with focal lengths so many times as long."""
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor)
+
     @property
     def K(self) -> Array:
         """The intrinsic matrix [3, 3]."""

@@ -10,7 +10,7 @@ Kalibr (Furgale et al., IROS 2013) with the lens among the unknowns.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -268,8 +268,7 @@ def _compare(camera: Camera, R_cam_body: Array, pairs: _Pairs, x: Array) -> _Equ
 
 def _refined(camera: Camera, tracks: TurnTracks, R: Array, lens: Array) -> TwoViewEstimate:
     """Return the motion that tracks show with a lens [2]: logarithm of the focal length over the given, readout."""
-    k = float(np.exp(lens[0]))
-    first, last = _views(replace(camera, fx=camera.fx * k, fy=camera.fy * k), tracks, float(lens[1]))
+    first, last = _views(camera.with_focal(float(np.exp(lens[0]))), tracks, float(lens[1]))
     direction = direction_given_rotation(R, first, last)
     start = np.array([0.0, 0.0, 1.0]) if direction is None else direction
     return refine_two_view(R, start, first, last, _PIXEL_SIGMA / camera.fx, _CAUCHY)

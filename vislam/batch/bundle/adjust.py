@@ -42,7 +42,10 @@ def visual_factors(
     Its right column is x - rho, so its disparity is the inverse depth, and its noise that of x plus that of rho.
     """
     T = gtsam.Pose3(T_body_cam0)
-    K, K_stereo = gtsam.Cal3_S2(1.0, 1.0, 0.0, 0.0, 0.0), gtsam.Cal3_S2Stereo(1.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    focal, disparity = tracks.focal, tracks.disparity
+    K = gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
+    K_stereo = gtsam.Cal3_S2Stereo(focal, focal, 0.0, 0.0, 0.0, disparity / focal)
+    pixels, disparities = focal * tracks.xy, disparity * tracks.rho
     models: dict[tuple[int, int | None], gtsam.noiseModel.Base] = {}
     sigma = noise.sigma_px * tracks.sigma_per_px
     sigma_rho = noise.depth_factor * tracks.sigma_rho
@@ -53,13 +56,13 @@ def visual_factors(
         key = (int(steps[i]), int(depth_steps[i]) if with_depth[i] else None)
         if key not in models:
             models[key] = gtsam.noiseModel.Robust.Create(noise.kernel, _model(*key))
-        (x, y), a, b = tracks.xy[i], X(int(tracks.keyframe[i])), L(int(tracks.point[i]))
+        (x, y), a, b = pixels[i], X(int(tracks.keyframe[i])), L(int(tracks.point[i]))
         if with_depth[i]:
-            measured = gtsam.StereoPoint2(x, x - tracks.rho[i], y)
+            measured = gtsam.StereoPoint2(x, x - disparities[i], y)
             factors.append(gtsam.GenericStereoFactor3D(measured, models[key], a, b, K_stereo, False, False, T))
         else:
             factors.append(
-                gtsam.GenericProjectionFactorCal3_S2(tracks.xy[i], models[key], a, b, K, False, False, T)
+                gtsam.GenericProjectionFactorCal3_S2(pixels[i], models[key], a, b, K, False, False, T)
             )  # fmt: skip
     return factors
 

@@ -7,7 +7,7 @@ files (`graph_auto`); tracks are judged between rounds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -25,6 +25,7 @@ from vislam.batch.bundle.adjust import (
 from vislam.batch.bundle.chain import Chain
 from vislam.batch.bundle.loops import Loops, LoopVerdict
 from vislam.batch.bundle.rays import Mask, Tracks, collect, residuals, triangulate
+from vislam.batch.bundle.shared_errors import Seen, SharedErrors, profiled
 from vislam.batch.bundle.shutter import ReadoutSearch, camera_twists, readout_change_s, shear
 from vislam.config import BatchConfig, Config
 from vislam.core.chi_square import chi_square_limit
@@ -63,6 +64,7 @@ class BatchResult:
     sigma_px: float  # noise of the tracks as the residuals show it
     depth_factor: float  # the same for depth, times what was assumed
     readout_s: float  # of a rolling shutter; 0: global
+    calibration: Array  # [2, 2] relative errors of focal length and metres, and their sigmas (NaN: not computed)
     loops: list[LoopVerdict]
     tied_by_odometry: list[int]  # keyframes that saw too few landmarks
     own: dict[str, tuple[Array, Array]]  # own variables of further sensors [V] and their sigmas [V], NaN if not known
@@ -92,7 +94,8 @@ class _Batch:
         for record, keyframe in zip(self._chain.records, log.keyframes, strict=True):
             self._readings.append(record, keyframe.packet.readings)
         self._own_keys = self._readings.keys_of(range(len(self._chain.records)))
-        self._tracks = collect(log, config.frontend)
+        self._seen = Seen(collect(log, config.frontend))
+        self._tracks = self._seen.tracks()
         self._values = self._chain.initial()
         self._readings.complete(self._values)
         self._points: Array = np.zeros((self._tracks.points, 3))
@@ -102,7 +105,6 @@ class _Batch:
         self._readout_s = config.frontend.readout_s or 0.0
         self._learns_readout = config.frontend.readout_s is None
         self._readout = ReadoutSearch()
-        self._raw_xy = self._tracks.xy
         self._depth_factor = 1.0
         self._tied: list[int] = []
         self._graph = gtsam.NonlinearFactorGraph()
@@ -111,7 +113,7 @@ class _Batch:
 
     def run(self) -> BatchResult:
         """Choose loops, then alternate between judging tracks and optimising."""
-        config, start = self._config, gtsam.Values(self._values)
+        config, has_imu, start = self._config, self._chain.has_imu, gtsam.Values(self._values)
         try:
             if undecided := self._loops.choose(self._chain):
                 self._notes.append(undecided)
@@ -125,7 +127,10 @@ class _Batch:
             self._points = self._landmarks()
             if round_number > 0:
                 self._loops.drop_contradicted(self._poses())
+            if has_imu and round_number == 1 < config.rounds - 1 and (shared := self._calibrate()) is not None:
+                self._seen.errors = shared.values
             self._undo_shutter()
+            self._tracks = self._seen.tracks()
             self._estimate_noise()
         if solution is None:
             raise DataError(f"batch.rounds is {config.rounds}; one at least is needed")
@@ -173,19 +178,12 @@ class _Batch:
 
     def _optimise(self, first: bool) -> Solution:
         tracks, config, keep = self._tracks, self._config, self._keep
-        estimators = gtsam.noiseModel.mEstimator
-        weaker = config.vision_inflation  # the kernel bends where it would without
-        cauchy, huber = (
-            estimators.Cauchy.Create(_START_CAUCHY / weaker),
-            estimators.Huber.Create(config.huber_k / weaker),
-        )
-        noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, cauchy if first else huber)
         count = len(self._chain.records)
         seen = np.bincount(tracks.keyframe[keep], minlength=count)
         factors, self._tied = self._chain.factors(self._values, seen, _MIN_SEEN)
-        factors += visual_factors(tracks, keep, self._with_depth, self._T_body_cam0, noise)
         factors += self._loops.factors(self._poses())
         factors += self._readings.factors(self._values)
+        factors += self._visual_factors(tracks, first)
         graph, values, states = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
         for factor in factors:
             graph.add(factor)
@@ -207,6 +205,34 @@ class _Batch:
         if solution.note:
             self._notes.append(solution.note)
         return solution
+
+    def _visual_factors(self, tracks: Tracks, first: bool) -> list[gtsam.NonlinearFactor]:
+        estimators, weaker = gtsam.noiseModel.mEstimator, self._config.vision_inflation
+        if first:
+            kernel = estimators.Cauchy.Create(_START_CAUCHY / weaker)  # it bends where it would without
+        else:
+            kernel = estimators.Huber.Create(self._config.huber_k / weaker)
+        noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, kernel)
+        return visual_factors(tracks, self._keep, self._with_depth, self._T_body_cam0, noise)
+
+    def _calibrate(self) -> SharedErrors | None:
+        """Return what the last factors at their solution show of focal length and metres; None without cameras."""
+        rig = self._log.rig
+        if rig.is_blind or not self._keep.any():
+            return None
+        measures = (self._keep & self._with_depth).any()
+        sigmas = np.array([rig.cameras[0].sigmas.focal, rig.metres_sigma if measures else 0.0])
+        others = self._graph.size() - int(self._keep.sum())
+
+        def graph_at(errors: Array) -> gtsam.NonlinearFactorGraph:
+            graph = gtsam.NonlinearFactorGraph()
+            for i in range(others):
+                graph.add(self._graph.at(i))
+            for factor in self._visual_factors(self._seen.tracks(errors), first=False):
+                graph.add(factor)
+            return graph
+
+        return profiled(graph_at, self._values, self._seen.errors, sigmas, self._chain.has_imu)
 
     def _landmarks(self) -> Array:
         points = self._points.copy()
@@ -230,8 +256,7 @@ class _Batch:
         if self._learns_readout:
             left_s = readout_change_s(tracks, self._keep, error.xy, error.predicted_rho, twists)
             self._readout_s = self._readout.next_s(self._readout_s, left_s)
-        xy = self._raw_xy - self._applied_readout_s * shear(tracks, error.predicted_rho, twists)
-        self._tracks = replace(tracks, xy=xy)
+        self._seen.moved_xy = self._applied_readout_s * shear(tracks, error.predicted_rho, twists)
 
     def _estimate_noise(self) -> None:
         """Take the noise of pixels and depths from the medians of their residuals, three unknowns per point counted."""
@@ -253,11 +278,13 @@ class _Batch:
         poses = self._poses()
         usable = np.isfinite(tracks.rho)
         marginals = marginals_at(self._graph, self._values) if self._config.covariances else None
+        shared = self._calibrate() if self._config.covariances else None
         names = self._suite.names
         own = {name: self._readings.own(name, self._values, lambda keys: variances(marginals, keys)) for name in names}
         return BatchResult(
             T_map_body=poses,
-            states=self._states(poses, marginals),
+            states=self._states(poses, marginals, shared),
+            calibration=np.stack([self._seen.errors, np.full(2, np.nan) if shared is None else shared.sigmas]),
             cost_before=self._cost_at(start),
             cost_after=solution.cost_after,
             iterations=self._iterations,
@@ -287,9 +314,11 @@ class _Batch:
             values.insert(L(j), placed.points_m[j])
         return float(self._graph.error(values))
 
-    def _states(self, poses: Array, marginals: gtsam.Marginals | None) -> list[NavState]:
+    def _states(self, poses: Array, marginals: gtsam.Marginals | None, shared: SharedErrors | None) -> list[NavState]:
         count, has_imu = len(poses), self._chain.has_imu
         known = covariances(marginals, self._values, count, has_imu)
+        if shared is not None:
+            known += shared.added()
         states = []
         for k, record in enumerate(self._chain.records):
             velocity = gyro = accel = np.full(3, np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ Ints = NDArray[np.int64]
 
 _PASSES = 3  # of triangulation: weights need distances, which it gives
 _MIN_Z_M = 0.05  # a point nearer to a camera that saw it is no point
+_FOCAL_STEP = 1e-3  # relative, of the finite difference
 _UNKNOWN_INFORMATION = 1e-9  # 1/m^2, keeps the system of a track without parallax solvable
 
 
@@ -37,7 +38,10 @@ class Tracks:
     rho: Array  # [N] 1/m, NaN where depth was not measured
     sigma_rho: Array  # [N] 1/m
     row: Array  # [N] image row from -0.5 (first) to 0.5 (last)
+    by_focal: Array  # [N, 3] derivatives of xy and rho by the true focal lengths over those given
     points: int  # P
+    focal: float = 1.0  # the true one over that given: pixels, whose noise is known, are so many times xy
+    disparity: float = 1.0  # and what gave rho, a disparity or an inverse depth, so many times rho
 
     def __len__(self) -> int:
         return len(self.keyframe)
@@ -54,7 +58,7 @@ def collect(log: FactorLog, config: FrontEndConfig) -> Tracks:
     ids = np.concatenate([part.ids for part in parts])
     xy, sigma = np.concatenate([part.xy for part in parts]), np.concatenate([part.sigma_per_px for part in parts])
     rho, sigma_rho = np.concatenate([part.rho for part in parts]), np.concatenate([part.sigma_rho for part in parts])
-    row = np.concatenate([part.row for part in parts])
+    row, by_focal = np.concatenate([part.row for part in parts]), np.concatenate([part.by_focal for part in parts])
     _, first = np.unique(np.stack([keyframe, ids]), axis=1, return_index=True)  # a track has one place in a keyframe
     usable = np.zeros(len(ids), dtype=bool)
     usable[first] = True
@@ -65,7 +69,7 @@ def collect(log: FactorLog, config: FrontEndConfig) -> Tracks:
     count = int(point.max()) + 1 if len(point) else 0
     return Tracks(
         keyframe[usable], point.astype(np.int64), xy[usable], sigma[usable], rho[usable], sigma_rho[usable],
-        row[usable], count,
+        row[usable], by_focal[usable], count,
     )  # fmt: skip
 
 
@@ -80,25 +84,35 @@ class _Observed:
     rho: Array
     sigma_rho: Array
     row: Array
+    by_focal: Array
 
 
 def _observed(index: int, seen: Observations, rig: Rig, config: FrontEndConfig) -> _Observed:
     if rig.is_blind:
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
-        return _Observed(none, none, np.zeros((0, 2)), nothing, nothing, nothing, nothing)
+        return _Observed(none, none, np.zeros((0, 2)), nothing, nothing, nothing, nothing, np.zeros((0, 3)))
     n = len(seen.track_ids)
     camera = rig.cameras[0]
-    xy = camera.normalise(seen.pixels_px)
-    rho, sigma_rho = np.full(n, np.nan), np.full(n, np.nan)
-    if seen.right_px is not None and rig.is_stereo:
-        rho, sigma_rho = stereo_inverse_depth(rig, xy, seen.right_px, config.stereo_sigma_px)
-    elif seen.depth_m is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            rho = np.where(seen.depth_m > 0.0, 1.0 / seen.depth_m, np.nan)
-        sigma_rho = np.where(np.isfinite(rho), config.depth_sigma_rho, np.nan)
+    xy, rho, sigma_rho = _calibrated(seen, rig, config)
+    longer = replace(rig, cameras=tuple(c.with_focal(1.0 + _FOCAL_STEP) for c in rig.cameras))
+    xy_longer, rho_longer, _ = _calibrated(seen, longer, config)
+    by_focal = np.nan_to_num(np.column_stack([xy_longer - xy, rho_longer - rho])) / _FOCAL_STEP
     keyframe = np.full(n, index, dtype=np.int64)
     row = np.clip(seen.pixels_px[:, 1] / max(camera.height - 1.0, 1.0), 0.0, 1.0) - 0.5
-    return _Observed(keyframe, seen.track_ids.astype(np.int64), xy, _sigma_per_px(camera, xy), rho, sigma_rho, row)
+    ids = seen.track_ids.astype(np.int64)
+    return _Observed(keyframe, ids, xy, _sigma_per_px(camera, xy), rho, sigma_rho, row, by_focal)
+
+
+def _calibrated(seen: Observations, rig: Rig, config: FrontEndConfig) -> tuple[Array, Array, Array]:
+    """Return coordinates [N, 2], inverse depths [N] and their sigmas [N] as a rig gives them."""
+    xy = rig.cameras[0].normalise(seen.pixels_px)
+    if seen.right_px is not None and rig.is_stereo:
+        return xy, *stereo_inverse_depth(rig, xy, seen.right_px, config.stereo_sigma_px)
+    if seen.depth_m is None:
+        return xy, np.full(len(xy), np.nan), np.full(len(xy), np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rho = np.where(seen.depth_m > 0.0, 1.0 / seen.depth_m, np.nan)
+    return xy, rho, np.where(np.isfinite(rho), config.depth_sigma_rho, np.nan)
 
 
 def _sigma_per_px(camera: Camera, xy: Array) -> Array:

@@ -137,6 +137,7 @@ def _entry(result: BatchResult, log: FactorLog, trajectory: Trajectory, problems
         "pixel_sigma_px": result.sigma_px,
         "depth_sigma_factor": result.depth_factor,
         "readout_s": result.readout_s,
+        "calibration": dict(zip(("focal", "metres"), result.calibration.T.tolist(), strict=True)),
         "loops": {
             "offered": len(result.loops),
             "kept": sum(verdict.kept for verdict in result.loops),

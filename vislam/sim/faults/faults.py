@@ -163,9 +163,7 @@ def _turned(rig: Rig, deg: float) -> Rig:
 
 
 def _focal(rig: Rig, factor: float) -> Rig:
-    cameras = tuple(
-        replace(camera, fx=camera.fx * factor, fy=camera.fy * factor, sigmas=CameraSigmas()) for camera in rig.cameras
-    )
+    cameras = tuple(replace(camera.with_focal(factor), sigmas=CameraSigmas()) for camera in rig.cameras)
     return Rig(cameras, rig.T_body_cams, rig.has_depth)
 
 
