@@ -29,7 +29,7 @@ def seen_from(cameras, points, rng, sigma_px=0.0, with_depth=False):
     xy = c[:, :2] / c[:, 2:] + rng.normal(size=(len(c), 2)) * sigma_px / 400.0
     rho = 1.0 / c[:, 2] if with_depth else np.full(len(c), np.nan)
     n = len(c)
-    return Tracks(k, p, xy, np.full(n, 1 / 400.0), rho, np.full(n, 2e-3), np.zeros(n), len(points))
+    return Tracks(k, p, xy, np.full(n, 1 / 400.0), rho, np.full(n, 2e-3), np.zeros(n), np.zeros((n, 3)), len(points))
 
 
 def some_cameras(rng, count=6, step_m=0.2):

@@ -165,7 +165,7 @@ class Camera:
             raise DataError(f"{self.distortion} distortion takes {allowed} coefficients, got {len(self.coefficients)}")
 
     def with_focal(self, factor: float) -> Camera:
-        """Return the camera with focal lengths so many times as long."""
+        """Return the camera with focal lengths times a factor."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
     @property

@@ -208,10 +208,11 @@ class _Batch:
 
     def _visual_factors(self, tracks: Tracks, first: bool) -> list[gtsam.NonlinearFactor]:
         estimators, weaker = gtsam.noiseModel.mEstimator, self._config.vision_inflation
-        if first:
-            kernel = estimators.Cauchy.Create(_START_CAUCHY / weaker)  # it bends where it would without
-        else:
-            kernel = estimators.Huber.Create(self._config.huber_k / weaker)
+        cauchy, huber = (
+            estimators.Cauchy.Create(_START_CAUCHY / weaker),
+            estimators.Huber.Create(self._config.huber_k / weaker),
+        )
+        kernel = cauchy if first else huber  # it bends where it would with the noise as it is
         noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, kernel)
         return visual_factors(tracks, self._keep, self._with_depth, self._T_body_cam0, noise)
 

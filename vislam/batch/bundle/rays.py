@@ -40,8 +40,8 @@ class Tracks:
     row: Array  # [N] image row from -0.5 (first) to 0.5 (last)
     by_focal: Array  # [N, 3] derivatives of xy and rho by the true focal lengths over those given
     points: int  # P
-    focal: float = 1.0  # the true one over that given: pixels, whose noise is known, are so many times xy
-    disparity: float = 1.0  # and what gave rho, a disparity or an inverse depth, so many times rho
+    focal: float = 1.0  # the true one over that given: what was measured, with known noise, over xy
+    disparity: float = 1.0  # the same of what gave rho, a disparity or an inverse depth
 
     def __len__(self) -> int:
         return len(self.keyframe)
