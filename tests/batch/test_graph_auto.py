@@ -98,6 +98,16 @@ def test_residuals_show_by_how_much_the_noise_is_stated_wrongly():
     assert np.allclose(found, 1.0, atol=0.3)
 
 
+def test_a_sample_shows_what_all_edges_show(monkeypatch):
+    city = _city(0.0, 1)
+    poses = optimize_pose_graph(city.problem).poses
+    every = noise_of_kinds(city.problem, poses)
+    monkeypatch.setattr("vislam.batch.posegraph.noise._SAMPLE_MAX", 50)
+    for some, all_of_it in zip(noise_of_kinds(city.problem, poses), every, strict=True):
+        assert some.chi2 == all_of_it.chi2
+        assert some.redundancy == pytest.approx(all_of_it.redundancy, rel=0.05)
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_no_edge_gives_a_solution_more_than_it_says(d):
     problem, _ = world(d, n=60, loops=6, seed=5)

@@ -39,9 +39,20 @@ def test_a_file_gets_its_optimum_in_all_formats(tmp_path, capsys, d):
     assert f"from {told['chi2_file']:.6g} of the file&#x27;s poses" in page
     unlike = (".html", ".json")  # hold times, as does log.txt
     first = {p.name: p.read_bytes() for p in out.iterdir() if p.suffix not in unlike and p.name != "log.txt"}
-    assert run_verb(["posegraph", str(path), "--out", str(out)]) == 0
-    assert "chi2" in capsys.readouterr().out
+    assert run_verb(["posegraph", str(path), "--out", str(out), "--no-noise"]) == 0
+    said = capsys.readouterr().out
+    assert "chi2" in said
+    assert told["noise"]
+    assert "noise of" not in said
     assert first == {p.name: p.read_bytes() for p in out.iterdir() if p.name in first}
+
+
+def test_a_graph_whose_factor_does_not_fit_is_solved_and_reported(tmp_path, monkeypatch):
+    for module in ("structure", "certificate"):
+        monkeypatch.setattr(f"vislam.batch.posegraph.{module}.FACTOR_MAX_BYTES", 100_000)
+    write_g2o(world(3, n=300, loops=400)[0], tmp_path / "torus.g2o")
+    assert run_verb(["posegraph", str(tmp_path / "torus.g2o"), "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "report.html").is_file()
 
 
 def test_exit_codes(tmp_path, capsys, monkeypatch):

@@ -111,7 +111,7 @@ def _with_pose_graph(log: FactorLog, false: set[int]) -> FactorLog:
         graph = gtsam.NonlinearFactorGraph()
         for factor in factors + loops.factors(chain.poses):
             graph.add(factor)
-        values = solve(graph, values, list(values.keys()), 50).values
+        values = solve(graph, values, list(values.keys())).values
     poses = [values.atPose3(X(k)).matrix() for k in range(len(chain.records))]
     return replace(log, keyframes=[replace(k, T_map_body=T) for k, T in zip(log.keyframes, poses, strict=True)])
 

@@ -11,7 +11,6 @@ class BatchConfig:
     """Batch optimisation of a finished run: visual-inertial bundle adjustment over all keyframes."""
 
     rounds: Count = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
-    iterations: Count = 20  # most Levenberg-Marquardt steps of a round; converged earlier as a rule
     huber_k: Positive = 2.0  # standard deviations, in later rounds
     max_observations: Count = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
     vision_inflation: Positive = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
@@ -33,6 +32,7 @@ class PoseGraphConfig:
     iterations: Count = 100  # most of them; 3 to 8 as a rule
     tolerance: Positive = 1e-9  # of the cost: the decrease still to come at which to end
     inlier_probability: Probability = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
+    noise: bool = True  # report what residuals show of the stated noise: takes about as long as finding the optimum
     certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
     covariances: bool = False  # write those of all poses: in space 300 bytes each
     # what an iSAM file in the plane states: square roots of information, or covariances; auto tells and says so

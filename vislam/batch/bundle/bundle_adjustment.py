@@ -177,8 +177,7 @@ class _Batch:
         self._points = placed.points_m
 
     def _optimise(self, first: bool) -> Solution:
-        tracks, config, keep = self._tracks, self._config, self._keep
-        count = len(self._chain.records)
+        tracks, keep, count = self._tracks, self._keep, len(self._chain.records)
         seen = np.bincount(tracks.keyframe[keep], minlength=count)
         factors, self._tied = self._chain.factors(self._values, seen, _MIN_SEEN)
         factors += self._loops.factors(self._poses())
@@ -199,7 +198,7 @@ class _Batch:
         states += self._own_keys
         for j in np.unique(tracks.point[keep]).tolist():
             values.insert(L(j), self._points[j])
-        solution = solve(graph, values, states, config.iterations)
+        solution = solve(graph, values, states)
         self._graph = graph
         self._iterations += solution.iterations
         if solution.note:

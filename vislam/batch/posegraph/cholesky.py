@@ -20,6 +20,7 @@ from vislam.core.messages import Array
 
 _ROUTINES = ("cython_blas.dtrsm", "cython_blas.dsyrk", "cython_lapack.dpotrf")
 _TRSM, _SYRK, _POTRF = range(3)
+_TOGETHER, _ROOM = 8, 8_000_000  # edges that are solved for at once, and numbers that this may take
 _SMALL = 24  # pivots' columns up to which loops beat BLAS
 _SMALL_WORK = 40_000  # multiplications up to which they do
 
@@ -104,16 +105,16 @@ class Factor:
         """Return J @ A^-1 @ J^T [M, d, d] of pairs of free poses: J is jacobians [M, 2, d, d], by the ends' columns.
 
         `ends` [M, 2] are indices of free poses, -1 for one that is known. Only the fronts between the two poses and
-        the root are visited.
+        the root are visited: of neighbours, which are taken together, nearly the same.
         """
         s = self.symbolic
         front_of = np.repeat(np.arange(len(s.first) - 1), np.diff(s.first))
         places = np.where(ends >= 0, s.place[ends], -1)
-        out = np.zeros((len(ends), self.d, self.d))
-        _edge_covariances(
-            self.d, self._fronts, front_of, self._panels, places,
-            np.ascontiguousarray(jacobians.transpose(0, 1, 3, 2)), out,
-        )  # fmt: skip
+        order = np.argsort(places.max(axis=1), kind="stable")
+        found, out = np.zeros((len(ends), self.d, self.d)), np.empty((len(ends), self.d, self.d))
+        transposed = np.ascontiguousarray(jacobians[order].transpose(0, 1, 3, 2))
+        _edge_covariances(self.d, self._fronts, front_of, self._panels, places[order], transposed, found)
+        out[order] = found
         return out
 
 
@@ -129,53 +130,60 @@ def _log_diagonal(d: int, first: Ints, row_begin: Ints, panel_begin: Ints, panel
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _edge_covariances(  # noqa: PLR0912
+def _edge_covariances(
     d: int, fronts: _Fronts, front_of: Ints, panels: Array, places: Ints, transposed: Array, out: Array
 ) -> None:
-    """Solve L @ y = J^T along the path to the root and sum y^T @ y up."""
-    first, row_begin, rows, _, parent, panel_begin = fronts
-    y = np.zeros((first[-1] * d, d))
-    for m in range(len(places)):
-        low, high = -1, -1  # fronts still to visit: from the two ends, until the paths meet
-        for end in range(2):
-            place = places[m, end]
-            if place < 0:
-                continue
+    """Solve L @ y = J^T of some edges at a time along their paths to the root, and sum y^T @ y up."""
+    first, parent = fronts.first, fronts.parent
+    together = max(1, min(_TOGETHER, _ROOM // (first[-1] * d * d)))
+    y, visited = np.zeros((first[-1] * d, together * d)), np.zeros(len(parent), dtype=np.bool_)
+    for begin in range(0, len(places), together):
+        count, lowest = min(together, len(places) - begin), len(parent)
+        for m in range(count):
+            for end in range(2):
+                place = places[begin + m, end]
+                if place < 0:
+                    continue
+                y[place * d : (place + 1) * d, m * d : (m + 1) * d] += transposed[begin + m, end]
+                f = front_of[place]
+                lowest = min(lowest, f)
+                while f != -1 and not visited[f]:
+                    visited[f], f = True, parent[f]
+        for f in range(lowest, len(parent)):
+            if visited[f]:
+                visited[f] = False
+                _pass_front(d, fronts, f, panels, y[:, : count * d], out[begin : begin + count])
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _pass_front(d: int, fronts: _Fronts, f: int, panels: Array, y: Array, out: Array) -> None:
+    """Solve for a front's pivots, take them from the rows beneath, and add what they give to `out`."""
+    first, row_begin = fronts.first, fronts.row_begin
+    width = (first[f + 1] - first[f]) * d
+    height = width + (row_begin[f + 1] - row_begin[f]) * d
+    panel = panels[fronts.panel_begin[f] * d * d : fronts.panel_begin[f + 1] * d * d]
+    own = y[first[f] * d : first[f + 1] * d]
+    for j in range(width):
+        column, known = panel[j * height : (j + 1) * height], own[j]
+        for c in range(len(known)):
+            known[c] /= column[j]
+        for i in range(j + 1, width):
+            goal, value = own[i], column[i]
+            for c in range(len(known)):
+                goal[c] -= value * known[c]
+        for m in range(len(out)):
+            for a in range(d):
+                for c in range(d):
+                    out[m, a, c] += known[m * d + a] * known[m * d + c]
+    for j in range(0, width, 3):  # blocks are of 3 or 6
+        p, q, s = own[j], own[j + 1], own[j + 2]
+        for r in range(row_begin[f], row_begin[f + 1]):
             for i in range(d):
-                for c in range(d):
-                    y[place * d + i, c] += transposed[m, end, i, c]
-            if low == -1:
-                low = front_of[place]
-            else:
-                high = front_of[place]
-        while low != -1 or high != -1:
-            f = high if low == -1 or (high != -1 and high < low) else low
-            if low == f:
-                low = parent[f]
-            if high == f:
-                high = parent[f]
-            width, height = (
-                (first[f + 1] - first[f]) * d,
-                (first[f + 1] - first[f] + row_begin[f + 1] - row_begin[f]) * d,
-            )
-            panel = panels[panel_begin[f] * d * d : panel_begin[f + 1] * d * d]
-            own = y[first[f] * d : first[f + 1] * d]
-            for j in range(width):
-                column = panel[j * height : (j + 1) * height]
-                for c in range(d):
-                    own[j, c] /= column[j]
-                for i in range(j + 1, width):
-                    for c in range(d):
-                        own[i, c] -= column[i] * own[j, c]
-                for a in range(d):
-                    for c in range(d):
-                        out[m, a, c] += own[j, a] * own[j, c]
-                for r in range(row_begin[f], row_begin[f + 1]):
-                    at = width + (r - row_begin[f]) * d
-                    for i in range(d):
-                        for c in range(d):
-                            y[rows[r] * d + i, c] -= column[at + i] * own[j, c]
-            own[:] = 0.0
+                goal, at = y[fronts.rows[r] * d + i], j * height + width + (r - row_begin[f]) * d + i
+                u, v, w = panel[at], panel[at + height], panel[at + 2 * height]
+                for c in range(len(p)):
+                    goal[c] -= u * p[c] + v * q[c] + w * s[c]
+    own[:] = 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 _REDUNDANCY_MIN = 10.0  # numbers; fewer say nothing about a scale
 _SHARE_MIN = 0.02  # of the measured numbers of a kind; where nearly all are taken up by the solution, neither
-_SAMPLE = 1000  # edges of each kind whose covariances are computed
+_SAMPLE_MIN, _SAMPLE_MAX = 50, 1000  # edges of each kind whose covariances are computed
 _ANY_HEADING = 3.0 / np.pi**2  # information of an angle that may be any: it is none
 _TINY = 1e-10
 
@@ -95,36 +95,37 @@ def _right_jacobian_inverse(r: Array) -> Array:
 def noise_of_kinds(problem: PoseGraphProblem, poses: Array, weights: Array | None = None) -> tuple[NoiseOfKind, ...]:
     """Return what the edges with weight show at poses [N, d + 1, d + 1], the optimum: four kinds, those that exist.
 
-    Of kinds with more than 1000 edges every n-th stands for all. Raises UsageError where the factor does not fit.
+    Chi-square is that of all edges, of redundancies the mean of as many as take about the time of the solution, every
+    n-th of a kind. Raises UsageError where the factor does not fit.
     """
     used = np.arange(len(problem.edges)) if weights is None else np.flatnonzero(weights > 0.0)
     if not len(used):
         return ()
-    structure, ones = Structure(problem.with_edges(used)), np.ones(len(used))
-    successive = np.abs(problem.edges[used, 1] - problem.edges[used, 0]) == 1
-    counts = int(successive.sum()), int((~successive).sum())
-    used = np.concatenate([spread_out(used[successive], _SAMPLE), spread_out(used[~successive], _SAMPLE)])
-    inside = np.ones(len(used), dtype=np.bool_)
-    S, _ = covariances_of_edges(structure, problem, poses, ones, used, inside)
-    W, r = problem.information[used], problem.residuals(poses)[used]
-    chi2 = r * np.einsum("eab,eb->ea", W, r)
-    taken = np.einsum("eab,eba->ea", W, S)
+    structure = Structure(problem.with_edges(used))
+    most = int(np.clip(structure.symbolic.affordable(), _SAMPLE_MIN, _SAMPLE_MAX))
+    is_odometry = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
+    kinds = {"odometry": used[is_odometry[used]], "loops": used[~is_odometry[used]]}
+    sample = np.concatenate([spread_out(edges, most) for edges in kinds.values()])
+    inside = np.ones(len(sample), dtype=np.bool_)
+    S, _ = covariances_of_edges(structure, problem, poses, np.ones(len(used)), sample, inside)
+    W, r = problem.information, problem.residuals(poses)
     turn = problem.tangent - problem.dimension
     measured = np.diagonal(W, axis1=1, axis2=2) > np.where(np.arange(problem.tangent) < turn, _ANY_HEADING, 0.0)
-    chi2, taken = np.where(measured, chi2, 0.0), np.where(measured, taken, 0.0)
-    odometry = np.abs(problem.edges[used, 1] - problem.edges[used, 0]) == 1
+    chi2 = np.where(measured, r * np.einsum("eab,eb->ea", W, r), 0.0)
+    taken = np.where(measured[sample], np.einsum("eab,eba->ea", W[sample], S), 0.0)
     found = []
-    for name, of_kind, edges in (("odometry", odometry, counts[0]), ("loops", ~odometry, counts[1])):
-        times = edges / max(int(of_kind.sum()), 1)
+    for name, edges in kinds.items():
+        of_kind = is_odometry[sample] == (name == "odometry")
         for part, columns in (("rotation", slice(None, turn)), ("translation", slice(turn, None))):
-            numbers = round(times * int(measured[of_kind, columns].sum()))
+            numbers = int(measured[edges, columns].sum())
             if not numbers:
                 continue
-            total = times * max(float(chi2[of_kind, columns].sum()), 0.0)
-            redundancy = max(numbers - times * float(taken[of_kind, columns].sum()), 0.0)
+            total = max(float(chi2[edges, columns].sum()), 0.0)
+            share = float(taken[of_kind, columns].sum()) / max(int(measured[sample[of_kind], columns].sum()), 1)
+            redundancy = max(numbers * (1.0 - share), 0.0)
             is_enough = redundancy >= max(_REDUNDANCY_MIN, _SHARE_MIN * numbers)
             factor = max(total / redundancy, _TINY) if is_enough else float("nan")
-            found.append(NoiseOfKind(f"{name} {part}", edges, numbers, total, redundancy, factor, 1.0))
+            found.append(NoiseOfKind(f"{name} {part}", len(edges), numbers, total, redundancy, factor, 1.0))
     return tuple(found)
 
 

@@ -15,6 +15,7 @@ from vislam.batch.posegraph.ordering import Ints, adjacency, minimum_degree
 from vislam.core.jit import njit
 
 _NONE = -1
+_SLOWER = 0.1  # than a factorisation are solves for a few columns, product by product
 FACTOR_MAX_BYTES = 1_500_000_000  # beyond, graphs of 100,000 poses would not be solved within 4 GB
 
 
@@ -47,6 +48,13 @@ class Symbolic:
         """Products of blocks that a factorisation takes, about."""
         width, below = np.diff(self.first).astype(np.float64), np.diff(self.row_begin)
         return float(np.dot(width, (width + below) ** 2))
+
+    def affordable(self) -> int:
+        """Return how many pairs of poses can have their covariance in the time of a factorisation or two, about."""
+        blocks = np.diff(self.panel_begin).astype(np.float64)  # from each front to its root, once added up
+        for f in range(len(blocks) - 1, -1, -1):
+            blocks[f] += blocks[self.parent[f]] if self.parent[f] != _NONE else 0.0
+        return int(_SLOWER * self.work / max(np.average(blocks, weights=np.diff(self.first)), 1.0))
 
     def bytes(self, d: int) -> int:
         """Return the memory that a factor with blocks of size d takes."""

@@ -45,13 +45,15 @@ class Uncertainty:
 
     def of(self, ids: Ids) -> Array:
         """Return the covariances [M, k, k] of poses, zero for anchors. Raises UsageError for an unknown id."""
-        out = [self._column(i)[i] for i in self._places(ids).tolist()]
-        return _symmetric(np.array(out).reshape(-1, self._problem.tangent, self._problem.tangent))
+        at, k = self._places(ids), self._problem.tangent
+        ends = np.column_stack([self._structure.index[at], np.full(len(at), -1)])
+        return self._factor.edge_covariances(ends, np.tile(np.eye(k), (len(at), 2, 1, 1)))
 
     def of_all(self) -> Array:
         """Return the covariances [N, k, k] of all poses, zero for anchors."""
         out = np.zeros((len(self._poses), self._problem.tangent, self._problem.tangent))
-        out[self._structure.free] = _symmetric(inverse_diagonal(self._factor))
+        inverse = inverse_diagonal(self._factor)
+        out[self._structure.free] = 0.5 * (inverse + inverse.transpose(0, 2, 1))
         return out
 
     def relative(self, pairs: Ids) -> Array:
@@ -65,13 +67,9 @@ class Uncertainty:
             i, j = self._problem.ids[at[apart[0]]].tolist()
             raise UsageError(f"no measurements connect the poses {i} and {j}; their relative motion is unknown")
         between = invert_many(self._poses[at[:, 1]]) @ self._poses[at[:, 0]]
-        A = -adjoints(between)
-        out = np.empty((len(at), self._problem.tangent, self._problem.tangent))
-        for m, (i, j) in enumerate(at.tolist()):
-            of_i, of_j = self._column(i), self._column(j)
-            cross = A[m] @ of_j[i]
-            out[m] = A[m] @ of_i[i] @ A[m].T + cross + cross.T + of_j[j]
-        return _symmetric(out)
+        turned = np.tile(np.eye(self._problem.tangent), (len(at), 2, 1, 1))
+        turned[:, 0] = -adjoints(between)
+        return self._factor.edge_covariances(self._structure.index[at], turned)
 
     def _places(self, ids: Ids) -> Ids:
         ids = np.asarray(ids, dtype=np.int64)
@@ -79,18 +77,6 @@ class Uncertainty:
         if len(missing := np.flatnonzero(self._problem.ids[at] != ids)):
             raise UsageError(f"there is no pose {ids[missing[0]]} in the graph")
         return at
-
-    def _column(self, i: int) -> Array:
-        """Return the column [N, k, k] of the covariance that belongs to a pose."""
-        free, k = self._structure.free, self._problem.tangent
-        column = np.zeros((len(self._poses), k, k))
-        place = self._structure.index[i]
-        if place >= 0:
-            for a in range(k):
-                unit = np.zeros((len(free), k))
-                unit[place, a] = 1.0
-                column[free, :, a] = self._factor.solve(unit)
-        return column
 
 
 def ellipses(
@@ -145,7 +131,3 @@ def inverse_diagonal(factor: Factor) -> Array:
         for k in range(width // d):
             out[factor.node[s.first[f] + k]] = full[k * d : (k + 1) * d, k * d : (k + 1) * d]
     return out
-
-
-def _symmetric(W: Array) -> Array:
-    return 0.5 * (W + W.transpose(0, 2, 1))

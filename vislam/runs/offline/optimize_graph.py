@@ -80,7 +80,8 @@ def _noise(
             raise UsageError("--rescale-noise knows no landmarks and no priors, which this graph has; leave it away")
         return problem, solution, ()
     try:
-        noise = noise_of_kinds(problem, solution.poses, solution.weights)
+        wanted = config.noise or config.rescale_noise
+        noise = noise_of_kinds(problem, solution.poses, solution.weights) if wanted else ()
     except UsageError:
         if config.rescale_noise:
             raise

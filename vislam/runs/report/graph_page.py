@@ -10,7 +10,7 @@ from vislam.batch.posegraph.certificate import Certificate
 from vislam.batch.posegraph.optimize import PoseGraphSolution
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
-from vislam.core.errors import DataError
+from vislam.core.errors import DataError, UsageError
 from vislam.core.files import write_text
 from vislam.core.messages import Array
 from vislam.runs.report.drawing import Axis, Lines, drawing
@@ -94,7 +94,7 @@ def _regions(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[Ar
     chosen = np.flatnonzero(problem.is_pose | problem.is_point)[step // 2 :: step]
     try:
         covariances = Uncertainty(problem, solution.poses, solution.weights).of(problem.ids[chosen])
-    except DataError:
+    except (DataError, UsageError):  # undetermined, or too large a factor
         return np.empty((0, 1, 2)), 1.0
     axes = _plane(solution.poses)
     outlines = ellipses(solution.poses[chosen], covariances, axes=axes)
