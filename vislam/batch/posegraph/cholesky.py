@@ -109,7 +109,7 @@ class Factor:
         """
         s = self.symbolic
         front_of = np.repeat(np.arange(len(s.first) - 1), np.diff(s.first))
-        places = np.where(ends >= 0, s.place[ends], -1)
+        places = np.append(s.place, -1)[ends]
         order = np.argsort(places.max(axis=1), kind="stable")
         found, out = np.zeros((len(ends), self.d, self.d)), np.empty((len(ends), self.d, self.d))
         transposed = np.ascontiguousarray(jacobians[order].transpose(0, 1, 3, 2))
@@ -135,7 +135,7 @@ def _edge_covariances(
 ) -> None:
     """Solve L @ y = J^T of some edges at a time along their paths to the root, and sum y^T @ y up."""
     first, parent = fronts.first, fronts.parent
-    together = max(1, min(_TOGETHER, _ROOM // (first[-1] * d * d)))
+    together = max(1, min(_TOGETHER, _ROOM // max(first[-1] * d * d, 1)))
     y, visited = np.zeros((first[-1] * d, together * d)), np.zeros(len(parent), dtype=np.bool_)
     for begin in range(0, len(places), together):
         count, lowest = min(together, len(places) - begin), len(parent)

@@ -54,7 +54,7 @@ class Symbolic:
         blocks = np.diff(self.panel_begin).astype(np.float64)  # from each front to its root, once added up
         for f in range(len(blocks) - 1, -1, -1):
             blocks[f] += blocks[self.parent[f]] if self.parent[f] != _NONE else 0.0
-        return int(_SLOWER * self.work / max(np.average(blocks, weights=np.diff(self.first)), 1.0))
+        return int(_SLOWER * self.work * self.count / max(np.dot(blocks, np.diff(self.first)), 1.0))
 
     def bytes(self, d: int) -> int:
         """Return the memory that a factor with blocks of size d takes."""
