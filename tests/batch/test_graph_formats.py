@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vislam.batch.posegraph.files import graph_format, read_pose_graph, write_pose_graph
+from vislam.batch import optimize_pose_graph, read_pose_graph
+from vislam.batch.posegraph.files import graph_format, write_pose_graph
 from vislam.batch.posegraph.isam import read_isam, write_isam
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.toro import read_toro, write_toro
@@ -133,6 +134,32 @@ def test_orders_of_the_files(tmp_path: Path) -> None:
     assert got.edges.tolist() == [[0, 1], [1, 2]]
 
 
+def test_two_names_of_one_pose_are_one_place(tmp_path: Path) -> None:
+    path = tmp_path / "two_names.toro"
+    edges = [f"EDGE2 {ends} 1 0 1.5 1 0 1 1 0 0" for ends in ("0 1", "1 2", "3 4")]
+    path.write_text("\n".join([*edges, "EQUIV 2 3"]) + "\n")
+    poses = optimize_pose_graph(read_pose_graph(path)).poses
+    assert np.allclose(poses[2], poses[3], atol=1e-5)
+    assert np.allclose(np.linalg.norm(np.diff(poses[[0, 1, 2, 4], :2, 2], axis=0), axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ending", "line"),
+    [
+        ("g2o", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"),
+        ("toro", "EDGE2 0 1 1 0 0 1 0 1 1 0 0"),
+        ("isam", "EDGE2 0 1 1 0 0 1 0 0 1 0 1"),
+    ],
+)
+def test_what_measures_no_pose_is_passed_over_and_counted(tmp_path: Path, ending: str, line: str) -> None:
+    path = tmp_path / f"log.{ending}"
+    path.write_text(f"ROBOTLASER1 0 -1.57 3.14 0.01 30 0.1 0 2 1.5 1.6 0\n{line}\nROBOTLASER1 1\nVERTEX_TAG 0 door\n")
+    problem = read_pose_graph(path)
+    assert problem.ids.tolist() == [0, 1]
+    for count in ("2 lines of ROBOTLASER1", "1 lines of VERTEX_TAG"):
+        assert f"{count} passed over: they measure no pose" in problem.notes
+
+
 def test_which_format_it_is(tmp_path: Path) -> None:
     texts = {
         "g2o": "# x\nVERTEX_SE2 0 0 0 0\n",
@@ -201,7 +228,7 @@ def test_every_damage_of_a_field_is_refused_with_its_line(
         (read_toro, ["EDGE2 3 3 1 0 0 1 0 1 1 0 0"], "itself"),
         (read_toro, ["VERTEX2 0 0 0 0", "VERTEX3 1 0 0 0 0 0 0"], "plane"),
         (read_toro, ["VERTEX2 0 0 0 0", "VERTEX2 0 1 0 0"], "given other values"),
-        (read_toro, ["EQUIV 0 1"], "EQUIV"),
+        (read_toro, ["TRIANGLE 0 1"], "TRIANGLE"),
         (read_toro, ["# nothing"], "no poses"),
         (read_isam, ["ODOMETRY 0 1 1 0 0 0 0 0 0 0 0"], "zero"),
         (read_isam, ["ODOMETRY 0 1 1 0 0 1e200 0 0 1 0 1"], "not finite"),

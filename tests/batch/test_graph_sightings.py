@@ -237,6 +237,23 @@ def test_a_landmark_that_loses_all_its_sightings_is_named(tmp_path):
         assert any("lost all their sightings (the first: 99999)" in note for note in solution.notes)
 
 
+def test_landmarks_that_isam_counts_apart_from_poses(tmp_path):
+    lines, _, _ = loop_of_sightings(3)
+    fields = [line.split() for line in lines]
+    first = min(int(f[2]) for f in fields if f[0] == "LANDMARK")
+    apart = [" ".join([*f[:2], str(int(f[2]) - first), *f[3:]] if f[0] == "LANDMARK" else f) for f in fields]
+    mixed, plain = (read_pose_graph(written(tmp_path, *some)) for some in (apart, lines))
+    assert "numbered from 240 on" in mixed.notes[-1]
+    assert np.array_equal(mixed.edges, plain.edges)
+    assert np.array_equal(mixed.is_point, plain.is_point)
+
+
+def test_an_older_name_of_sightings(tmp_path):
+    lines = ["EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "LANDMARK2 0 5 1 1 10 0 10", "LANDMARK2 1 5 0 1 10 0 10"]
+    solution = optimize_pose_graph(read_pose_graph(written(tmp_path, *lines, ending="g2o")))
+    assert solution.poses[2, :2, 2] == pytest.approx([1.0, 1.0])
+
+
 def test_what_is_seen_along_one_direction_is_named(tmp_path, capsys):
     lines = ["VERTEX_SE2 0 0 0 0", "VERTEX_SE2 1 1 0 0", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1", "EDGE_SE2_XY 0 5 3 0 4 0 0"]
     path = written(tmp_path, *lines, ending="g2o")
@@ -255,7 +272,6 @@ def test_what_is_seen_along_one_direction_is_named(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("LANDMARK 0 1 1 0 1 0 1", r"isam:4: 1 is the id of a landmark and that of a pose"),
         ("LANDMARK 0 7 nan 0 1 0 1", r"isam:4: 'nan'"),
         ("LANDMARK 0 7 1 0 0 0 0", r"isam:4: the information is zero"),
         ("LANDMARK 0 7 1 0 1e200 0 1", r"isam:4: the square of"),
@@ -264,7 +280,6 @@ def test_what_is_seen_along_one_direction_is_named(tmp_path, capsys):
         ("BR 0 7 0.1 -2 0.1 0.1", r"isam:4: the range is -2"),
         ("BR 0 7 0.1 2 0 0.1", r"isam:4: the bearing's sigma is 0"),
         ("BR 0 7 0.1 2 1e-200 0.1", r"isam:4: the information is not finite"),
-        ("BR 0 0 0.1 2 0.1 0.1", r"isam:4: 0 is the id of a landmark and that of a pose"),
         ("EDGE3 0 7 1 0 0 0 0 0 " + "1 " * 21, r"isam:4: poses in the plane and in space"),
     ],
 )

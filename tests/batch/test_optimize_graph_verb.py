@@ -55,6 +55,16 @@ def test_a_graph_whose_factor_does_not_fit_is_solved_and_reported(tmp_path, monk
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.parametrize(
+    "options", [(), ("--robust", "auto", "--covariances"), ("--method", "gtsam"), ("--rescale-noise",)]
+)
+def test_poses_that_are_all_fixed_are_answered_with_their_cost(tmp_path, capsys, options):
+    path = tmp_path / "fixed.g2o"
+    path.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.1\nFIX 0 1\nEDGE_SE2 0 1 1 0 0 4 0 0 4 0 4\n")
+    assert run_verb(["posegraph", str(path), "--out", str(tmp_path / "out"), "--json", *options]) == 0
+    assert json.loads(capsys.readouterr().out)["chi2_after"] == pytest.approx(0.04)
+
+
 def test_exit_codes(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     problem, _ = world(2)

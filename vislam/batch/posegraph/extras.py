@@ -26,6 +26,7 @@ from vislam.core.messages import Array
 EXTRA_2D = {  # tag: ids and numbers
     "VERTEX_XY": (1, 2),
     "EDGE_SE2_XY": (2, 5),
+    "LANDMARK2": (2, 5),  # an older name of it
     "EDGE_PRIOR_SE2": (1, 9),
     "EDGE_PRIOR_SE2_XY": (1, 5),
     "EDGE_PRIOR_XY": (1, 5),
@@ -117,6 +118,7 @@ def read_extras(path: Path, rows: Mapping[str, Rows], d: int) -> Extras:
         points = rows["VERTEX_XY"]
         parts = [
             _positions(rows["EDGE_SE2_XY"], True, True),
+            _positions(rows["LANDMARK2"], True, True),
             _priors_2d(rows["EDGE_PRIOR_SE2"]),
             _positions(rows["EDGE_PRIOR_SE2_XY"], False, False),
             _positions(rows["EDGE_PRIOR_XY"], False, True),

@@ -45,7 +45,7 @@ def read_g2o(path: Path, repair: bool = False) -> PoseGraphProblem:
     it of the vector part of the quaternion, half of that). Raises DataError with the line number on damage of any kind,
     on both dimensions in one file and on tags that it does not know; see `problem_from_lines` for the rest.
     """
-    found = read_tagged_lines(path, _COLUMNS | EXTRA_COLUMNS)
+    found, passed_over = read_tagged_lines(path, _COLUMNS | EXTRA_COLUMNS).without_data()
     rows = found.rows
     in_plane, in_space = (
         [rows[tag].lines for tag in (pose, edge, *extra)]
@@ -69,10 +69,11 @@ def read_g2o(path: Path, repair: bool = False) -> PoseGraphProblem:
     edge_lines = EdgeLines(edges.ids, measured, information, edges.lines)
     extras = read_extras(path, rows, d)
     if not len(extras):
-        return problem_from_lines(path, d, pose_lines, edge_lines, fixed_ids, passed, repair)
+        return problem_from_lines(path, d, pose_lines, edge_lines, fixed_ids, passed, repair).noted(passed_over)
     pose_lines, edge_lines = extras.joined(path, pose_lines, edge_lines)
     world = ((0, int(pose_lines.ids[-1])),) if extras.has_priors else ()
-    return extras.marked(problem_from_lines(path, d, pose_lines, edge_lines, fixed_ids + world, passed, repair))
+    problem = problem_from_lines(path, d, pose_lines, edge_lines, fixed_ids + world, passed, repair)
+    return extras.marked(problem).noted(passed_over)
 
 
 def write_g2o(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:

@@ -27,6 +27,7 @@ from vislam.batch.posegraph.angles import (
     refuse_other_tags,
     refuse_what_is_lost,
 )
+from vislam.batch.posegraph.extras import Extras
 from vislam.batch.posegraph.landmark_lines import (
     BEARING_RANGE_COLUMNS,
     LANDMARK_COLUMNS,
@@ -38,7 +39,7 @@ from vislam.batch.posegraph.landmark_lines import (
 )
 from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_lines
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
-from vislam.batch.posegraph.tagged_lines import Rows, TaggedLines, read_tagged_lines
+from vislam.batch.posegraph.tagged_lines import Rows, read_tagged_lines
 from vislam.core.errors import DataError, UsageError
 from vislam.core.files import write_text
 from vislam.core.messages import Array
@@ -46,7 +47,7 @@ from vislam.core.messages import Array
 _EDGES_2D = ("ODOMETRY", "EDGE2", "Constraint2")
 _SEEN = LANDMARK_COLUMNS | BEARING_RANGE_COLUMNS
 _COLUMNS = dict.fromkeys(_EDGES_2D, (2, 9)) | {"EDGE3": (2, 27), "POSE3D_INIT": (1, 6)} | _SEEN
-_IGNORED = ("SOLVE", "EDGE3_INIT", "EDGE3_TRUE", "POSE3D_TRUE")  # orders to the program and yardsticks, no measurements
+_MAX_ID = 2**63 - 1
 _UPRIGHT = 1e-6  # cosine of the pitch
 
 
@@ -55,12 +56,11 @@ def read_isam(path: Path, repair: bool = False, noise: Noise | Literal["auto"] =
 
     There are no poses of the plane to start from. Edges are in the order of the file, landmarks behind them. `noise`
     is what stands for it in the plane: the square root of information, as in iSAM, or covariances; "auto" decides.
-    Raises DataError with the line number on damage of any kind, on both dimensions in one file, on other tags and on an
-    id of a landmark that is a pose's too; see `problem_from_lines` for the rest.
+    Raises DataError with the line number on damage of any kind, on both dimensions in one file, and on other tags;
+    landmarks whose ids are poses', too, are numbered behind these; see `problem_from_lines` for the rest.
     """
-    found = read_tagged_lines(path, _COLUMNS)
-    kept = [(line, text) for line, text in found.others if text.split()[0] not in _IGNORED]
-    refuse_other_tags(path, TaggedLines(found.rows, kept), _COLUMNS)
+    found, passed_over = read_tagged_lines(path, _COLUMNS).without_data()
+    refuse_other_tags(path, found, _COLUMNS)
     plane, space = _joined([found.rows[tag] for tag in _EDGES_2D]), (found.rows["POSE3D_INIT"], found.rows["EDGE3"])
     seen = [found.rows[tag] for tag in _SEEN if len(found.rows[tag].lines)]
     first_seen = min((int(rows.lines[0]) for rows in seen), default=0)
@@ -77,8 +77,24 @@ def read_isam(path: Path, repair: bool = False, noise: Noise | Literal["auto"] =
     if not first_seen:
         problem = problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
     else:
-        problem = with_sightings(path, poses, found_edges, read_sightings(path, found.rows, form), repair)
-    return replace(problem, notes=problem.notes + notes)
+        sightings, renumbered = _numbered_apart(read_sightings(path, found.rows, form), found_edges)
+        problem = with_sightings(path, poses, found_edges, sightings, repair)
+        notes += renumbered
+    return problem.noted(notes + passed_over)
+
+
+def _numbered_apart(seen: Extras, edges: EdgeLines) -> tuple[Extras, tuple[str, ...]]:
+    """Return sightings whose landmarks have ids of their own, and a note where that changed them.
+
+    iSAM counts poses and landmarks apart, so the same number may stand for one of each.
+    """
+    of_poses = np.concatenate([edges.ids.ravel(), seen.observer])
+    landmarks, at = np.unique(seen.to, return_inverse=True)
+    first = int(of_poses.max()) + 1
+    if not np.isin(landmarks, of_poses).any() or first + len(landmarks) > _MAX_ID:
+        return seen, ()
+    note = f"landmarks {landmarks[0]} to {landmarks[-1]} have ids of poses; they are numbered from {first} on"
+    return replace(seen, to=first + at), (note,)
 
 
 def _form(edges: Rows, noise: Noise | Literal["auto"]) -> tuple[Noise, tuple[str, ...]]:

@@ -63,6 +63,10 @@ class PoseGraphProblem:
     def __repr__(self) -> str:
         return f"PoseGraphProblem({len(self.ids)} poses of dimension {self.dimension}, {len(self.edges)} edges)"
 
+    def noted(self, notes: tuple[str, ...]) -> PoseGraphProblem:
+        """Return the problem with more notes."""
+        return replace(self, notes=self.notes + notes)
+
     def with_edges(self, edges: Ids | Mask) -> PoseGraphProblem:
         """Return the problem with some of its edges, by index or by a mask [E]."""
         return replace(

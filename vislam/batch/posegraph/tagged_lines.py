@@ -7,6 +7,7 @@ fill. Numbers are converted as exactly as Python's float() does.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,11 @@ _TOO_FEW, _TOO_MANY, _NOT_NUMBER, _NOT_ID, _NOT_FINITE = range(1, 6)
 _OTHER = -1
 _NO_EXPONENT = 1 << 40
 _POWERS_OF_TEN = 10.0 ** np.arange(23)  # exact in double precision
+
+_DATA = frozenset({  # of g2o's viewers and logs, and of iSAM: scans, labels, lenses, orders to the program, true values
+    "ROBOTLASER1", "ROBOTLASER2", "RAWLASER1", "RAWLASER2", "VERTEX_TAG", "VERTEX_ELLIPSE", "PARAMS_CAMERACALIB",
+    "PARAMS_CAMERAPARAMETERS", "SOLVE", "EDGE3_INIT", "EDGE3_TRUE", "POSE3D_TRUE",
+})  # fmt: skip
 
 Bytes = NDArray[np.uint8]
 
@@ -56,6 +62,13 @@ class TaggedLines:
 
     rows: dict[str, Rows]  # for every tag asked for, also when it has none
     others: list[tuple[int, str]]  # lines of other tags with their numbers, in the order of the file
+
+    def without_data(self) -> tuple[TaggedLines, tuple[str, ...]]:
+        """Return the lines without those of tags that constrain nothing, and a note of how many each had."""
+        kept = [(line, text) for line, text in self.others if text.split()[0] not in _DATA]
+        left = Counter(tag for _, text in self.others if (tag := text.split()[0]) in _DATA)
+        notes = tuple(f"{count} lines of {tag} passed over: they measure no pose" for tag, count in left.items())
+        return TaggedLines(self.rows, kept), notes
 
 
 def read_tagged_lines(path: Path, columns: Mapping[str, tuple[int, int]]) -> TaggedLines:

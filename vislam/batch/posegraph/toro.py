@@ -28,18 +28,21 @@ from vislam.core.errors import DataError
 from vislam.core.files import write_text
 from vislam.core.messages import Array
 
-_COLUMNS = {"VERTEX2": (1, 3), "EDGE2": (2, 9), "VERTEX3": (1, 6), "EDGE3": (2, 27)} | BEARING_RANGE_COLUMNS
+_COLUMNS = BEARING_RANGE_COLUMNS | {
+    "VERTEX2": (1, 3), "EDGE2": (2, 9), "VERTEX3": (1, 6), "EDGE3": (2, 27), "EQUIV": (2, 0)
+}  # fmt: skip
 _ROWS_OF_TORO = [0, 1, 4, 2, 5, 3]  # its ff fs ss rr fr sr as an upper triangle in rows
+_SAME = 1e12  # 1/m^2 and 1/rad^2, of what EQUIV joins: a micrometre, and little enough for the solver
 _ORDER_3D = (3, 4, 5, 0, 1, 2)  # files have translation first
 
 
 def read_toro(path: Path, repair: bool = False) -> PoseGraphProblem:
     """Read VERTEX2, EDGE2 and BR (bearing and range of a landmark, as gtsam writes it), or VERTEX3 and EDGE3.
 
-    Raises DataError with the line number on damage of any kind, on both dimensions in one file and on other tags (EQUIV
-    among them: merge those poses first); see `problem_from_lines` for the rest.
+    Raises DataError with the line number on damage of any kind, on both dimensions in one file and on other tags; see
+    `problem_from_lines` for the rest. EQUIV, two names of one pose, is an edge without motion.
     """
-    found = read_tagged_lines(path, _COLUMNS)
+    found, passed_over = read_tagged_lines(path, _COLUMNS).without_data()
     refuse_other_tags(path, found, _COLUMNS)
     rows = found.rows
     vertices, edges, two = choose_dimension(path, (rows["VERTEX2"], rows["EDGE2"]), (rows["VERTEX3"], rows["EDGE3"]))
@@ -50,12 +53,19 @@ def read_toro(path: Path, repair: bool = False) -> PoseGraphProblem:
     else:
         information = symmetric(edges.numbers[:, 6:], _ORDER_3D)
     poses = PoseLines(vertices.ids[:, 0], poses_of(vertices.numbers, two), vertices.lines)
-    found_edges = EdgeLines(edges.ids, measured, information, edges.lines)
+    same, (k, size) = rows["EQUIV"], (information.shape[1], measured.shape[1])
+    found_edges = EdgeLines(
+        np.concatenate([edges.ids, same.ids]),
+        np.concatenate([measured, np.tile(np.eye(size), (len(same.ids), 1, 1))]),
+        np.concatenate([information, np.tile(_SAME * np.eye(k), (len(same.ids), 1, 1))]),
+        np.concatenate([edges.lines, same.lines]),
+    )
     if not len(rows["BR"].lines):
-        return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair)
+        return problem_from_lines(path, 2 if two else 3, poses, found_edges, repair=repair).noted(passed_over)
     if not two:
         raise DataError(f"{path}:{rows['BR'].lines[0]}: BR is of the plane, the poses are not; give one kind")
-    return with_sightings(path, poses, found_edges, read_sightings(path, {"BR": rows["BR"]}, "root"), repair)
+    seen = read_sightings(path, {"BR": rows["BR"]}, "root")
+    return with_sightings(path, poses, found_edges, seen, repair).noted(passed_over)
 
 
 def write_toro(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
