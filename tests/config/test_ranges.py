@@ -82,7 +82,7 @@ def test_every_number_among_the_options_of_a_verb_has_a_range(verb: str) -> None
         ("run tum:X --out OUT --frontend.max-tracks -5", "--frontend.max-tracks is -5; allowed is 1 or more"),
         ("posegraph X.g2o --iterations -1", "--iterations is -1; allowed is 1 or more"),
         ("optimize X.g2o --iterations -1", "--iterations is -1; allowed is 1 or more"),
-        ("optimize X --iterations -1", "--iterations is -1; allowed is 1 or more"),
+        ("optimize X --rounds -1", "--rounds is -1; allowed is 1 or more"),
         ("run tum:X --out OUT --ekf.gate-probability 2", "is 2; allowed is more than 0 and less than 1"),
         ("run tum:X --out OUT --machine.gravity-m-s2 nan", "--machine.gravity-m-s2 is nan; allowed is more than 0"),
         ("live --out OUT --sensors.webcam.width-px 0", "--sensors.webcam.width-px is 0; allowed is 1 or more"),
