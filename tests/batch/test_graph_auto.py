@@ -98,6 +98,12 @@ def test_residuals_show_by_how_much_the_noise_is_stated_wrongly():
     assert np.allclose(found, 1.0, atol=0.3)
 
 
+@pytest.mark.parametrize(("fraction", "robust", "hints"), [(0.0, "none", 0), (0.02, "none", 1), (0.8, "gnc", 1)])
+def test_loops_that_contradict_each_other_are_warned_of(fraction, robust, hints):
+    solution = optimize_pose_graph(_city(fraction, 1).problem, PoseGraphConfig(robust=robust))
+    assert sum("--robust auto" in note for note in solution.notes) == hints
+
+
 def test_a_sample_shows_what_all_edges_show(monkeypatch):
     city = _city(0.0, 1)
     poses = optimize_pose_graph(city.problem).poses

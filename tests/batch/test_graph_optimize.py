@@ -183,3 +183,4 @@ def test_the_best_known_cost_is_reached(data_root, name):
         solution = optimize_pose_graph(problem, PoseGraphConfig(method=method))
         assert solution.costs[-1] <= BEST[name] * (1.0 + 1e-6)
         assert len(solution.costs) <= 10
+        assert not any("--robust auto" in note for note in solution.notes)

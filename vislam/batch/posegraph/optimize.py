@@ -18,8 +18,11 @@ from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_m
 from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
+from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Array
+
+_BEYOND_MIN, _BEYOND_SHARE = 2, 0.01  # loops beyond what noise allows, which one in a thousand is, to be warned of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +82,8 @@ def optimize_pose_graph(
     descent = _descend(structure, start, config, progress)
     parts = structure.parts
     notes = [*problem.notes, *_of_landmarks(problem, descent.poses, weights)]
+    if config.robust != "auto":
+        notes += _of_loops(problem, descent.poses, weights, config.inlier_probability)
     if decision is not None and decision.warning:
         notes.append(decision.warning)
     if parts > 1:
@@ -122,6 +127,26 @@ def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> li
         return []
     free = undetermined_landmarks(problem, poses, weights)
     return [undetermined_message(free)] if len(free) else []
+
+
+def _of_loops(problem: PoseGraphProblem, poses: Array, weights: Array, probability: float) -> list[str]:
+    """Return what to warn of where loops contradict each other or odometry, and nothing has judged them."""
+    loops = np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1
+    kept = loops & (weights != 0.0)
+    limit = chi_square_limit(probability, problem.tangent)
+    beyond = int((problem.edge_chi2(poses)[kept] > limit).sum())
+    notes = []
+    if beyond >= max(_BEYOND_MIN, _BEYOND_SHARE * kept.sum()):
+        notes.append(
+            f"{beyond} of {kept.sum()} edges beside odometry are off by more than their noise allows: some are false, "
+            "which --robust auto finds, or the noise is stated too small, which --rescale-noise corrects"
+        )
+    if 2 * kept.sum() < loops.sum():
+        notes.append(
+            f"{kept.sum()} of {loops.sum()} edges beside odometry are kept: the few may agree by chance and end worse "
+            "than odometry; --robust auto judges this"
+        )
+    return notes
 
 
 def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, dict[str, float]]:
