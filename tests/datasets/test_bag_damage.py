@@ -182,7 +182,7 @@ def test_hostile_files_are_refused_in_one_line(name: str, data: bytes, tmp_path:
         open_dataset(str(path))
     assert len(str(told.value).splitlines()) == 1
     assert inspect(str(path)).worst == "error"
-    assert time.process_time() - begun < 100.0  # it ends; some seconds as a rule, as the machine is
+    assert time.process_time() - begun < 10.0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - grown < 600 * 1024
 
 

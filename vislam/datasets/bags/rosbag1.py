@@ -152,7 +152,10 @@ def _record(reader: Bytes | FileBytes, at: int) -> tuple[Fields, int, int]:
     header = reader.read(at + 4, length)
     if len(header) != length:
         raise DamagedError("record cut short")
-    return _fields(header), at + length + 8, _u32(reader.read(at + 4 + length, 4))
+    fields = _fields(header)
+    if b"op" not in fields:
+        raise DamagedError("record that does not state its kind")
+    return fields, at + length + 8, _u32(reader.read(at + 4 + length, 4))
 
 
 def _fields(data: bytes) -> Fields:
