@@ -110,12 +110,10 @@ def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: P
         reached = lambda process, spent_s=share * whole_s: cpu_s(process) >= spent_s  # noqa: E731
         ended = interrupted([*arguments, str(out)], reached, number, to_group=k % 2 == 0)
         check(ended, number, f"moment {k}, {share:.2f} of {whole_s:.2f} s of CPU")
-        if (
-            out / "mav0"
-        ).exists():  # whole or not at all, and in no other try's way: the signal came after its last file
-            made, wanted = ({p.relative_to(at) for p in (at / "mav0").rglob("*")} for at in (out, whole))
-            assert made == wanted
-            shutil.rmtree(out)
+        made, wanted = ({p.relative_to(at) for p in (at / "mav0").rglob("*")} for at in (out, whole))
+        assert made in (set(), wanted)  # whole, where the signal came after its last file, or not at all
+        if made:
+            shutil.rmtree(out)  # a try that failed is in no other one's way
 
 
 def test_a_live_run_ends_at_random_moments_and_can_be_started_again(tmp_path: Path) -> None:

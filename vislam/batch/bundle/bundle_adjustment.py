@@ -207,11 +207,8 @@ class _Batch:
 
     def _visual_factors(self, tracks: Tracks, first: bool) -> list[gtsam.NonlinearFactor]:
         estimators, weaker = gtsam.noiseModel.mEstimator, self._config.vision_inflation
-        cauchy, huber = (
-            estimators.Cauchy.Create(_START_CAUCHY / weaker),
-            estimators.Huber.Create(self._config.huber_k / weaker),
-        )
-        kernel = cauchy if first else huber  # it bends where it would with the noise as it is
+        shape, k = (estimators.Cauchy, _START_CAUCHY) if first else (estimators.Huber, self._config.huber_k)
+        kernel = shape.Create(k / weaker)  # it bends where it would with the noise as it is
         noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, kernel)
         return visual_factors(tracks, self._keep, self._with_depth, self._T_body_cam0, noise)
 
@@ -220,8 +217,7 @@ class _Batch:
         rig = self._log.rig
         if rig.is_blind or not self._keep.any():
             return None
-        measures = (self._keep & self._with_depth).any()
-        sigmas = np.array([rig.cameras[0].sigmas.focal, rig.metres_sigma if measures else 0.0])
+        sigmas = np.array([rig.cameras[0].sigmas.focal, rig.metres_sigma * (self._keep & self._with_depth).any()])
         others = self._graph.size() - int(self._keep.sum())
 
         def graph_at(errors: Array) -> gtsam.NonlinearFactorGraph:
@@ -232,7 +228,8 @@ class _Batch:
                 graph.add(factor)
             return graph
 
-        return profiled(graph_at, self._values, self._seen.errors, sigmas, self._chain.has_imu)
+        count, has_imu = len(self._chain.records), self._chain.has_imu
+        return profiled(graph_at, self._values, count, self._seen.errors, sigmas, has_imu)
 
     def _landmarks(self) -> Array:
         points = self._points.copy()

@@ -20,6 +20,8 @@ from vislam.core.messages import Array
 from vislam.factors.keys import B, V, X
 from vislam.factors.solvers import FAILURES
 
+GraphAt = Callable[[Array], gtsam.NonlinearFactorGraph]
+
 _STEP = 1e-3  # relative, of finite differences; well above rounding, and a tenth of a pixel at the edge of an image
 _FOLLOWING = 3  # steps of the states: under a robust kernel each goes 70 % of the way
 
@@ -67,15 +69,14 @@ class SharedErrors:
 
 
 def profiled(
-    graph_at: Callable[[Array], gtsam.NonlinearFactorGraph], values: gtsam.Values, at: Array, sigmas: Array, moves: bool
+    graph_at: GraphAt, values: gtsam.Values, count: int, at: Array, sigmas: Array, moves: bool
 ) -> SharedErrors | None:
     """Return the errors after a Newton step from `at` [2]; None where the linear system cannot be solved.
 
-    `graph_at` gives the factors at errors [2], `values` are the solution at `at`, `sigmas` [2] of the prior. Unless it
-    `moves`, the prior is all that is known of them.
+    `graph_at` gives the factors at errors [2], `values` are the solution of `count` keyframes at `at`, `sigmas` [2] of
+    the prior. Unless it `moves`, the prior is all that is known of them.
     """
     which = np.flatnonzero(sigmas > 0.0).tolist()
-    count = sum(values.exists(X(k)) for k in range(values.size()))
     H, gradient, by_error = np.zeros((2, 2)), np.zeros(2), np.zeros((count, 15, 2))
     if not which:
         return SharedErrors(at, H, by_error)

@@ -133,8 +133,7 @@ def _of_loops(problem: PoseGraphProblem, poses: Array, weights: Array, probabili
     """Return what to warn of where loops contradict each other or odometry, and nothing has judged them."""
     loops = np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1
     kept = loops & (weights != 0.0)
-    limit = chi_square_limit(probability, problem.tangent)
-    beyond = int((problem.edge_chi2(poses)[kept] > limit).sum())
+    beyond = int((problem.edge_chi2(poses)[kept] > chi_square_limit(probability, problem.tangent)).sum())
     notes = []
     if beyond >= max(_BEYOND_MIN, _BEYOND_SHARE * kept.sum()):
         notes.append(
