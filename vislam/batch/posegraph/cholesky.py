@@ -155,7 +155,7 @@ def _edge_covariances(
                 _pass_front(d, fronts, f, panels, y[:, : count * d], out[begin : begin + count])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, nogil=True, inline="always")
 def _pass_front(d: int, fronts: _Fronts, f: int, panels: Array, y: Array, out: Array) -> None:
     """Solve for a front's pivots, take them from the rows beneath, and add what they give to `out`."""
     first, row_begin = fronts.first, fronts.row_begin
