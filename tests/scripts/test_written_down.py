@@ -61,6 +61,7 @@ SMALLEST = {
     "experiments/plan_path.py": "{run} --out plan.png",
     "experiments/planar_odometry.py": "--source {cart} --out out",
     "experiments/relocalisation.py": "--recording {recording} --out out",
+    "experiments/robust_routes.py": "--simulated ring-once --false 0 --out routes.json",
     "experiments/seed_vocabulary.py": "--out words.npz --seeds 1 --duration-s 1",
     "experiments/self_calibration.py": "{recording} --out out",
     "experiments/spoilt_rgbd.py": "{recording} --cases 0",

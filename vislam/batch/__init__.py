@@ -13,7 +13,13 @@ if TYPE_CHECKING:
     from vislam.batch.posegraph.graph_file import PoseGraphFile
     from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
     from vislam.batch.posegraph.problem import PoseGraphProblem
-    from vislam.batch.posegraph.worlds import simulate_graph, write_simulated
+    from vislam.batch.posegraph.worlds import (
+        SimulatedGraph,
+        false_loops,
+        measured_graph,
+        simulate_graph,
+        write_simulated,
+    )
 
 __all__ = [
     "BatchResult",
@@ -21,6 +27,9 @@ __all__ = [
     "PoseGraphFile",
     "PoseGraphProblem",
     "PoseGraphSolution",
+    "SimulatedGraph",
+    "false_loops",
+    "measured_graph",
     "optimize_pose_graph",
     "optimize_run",
     "read_pose_graph",
@@ -38,6 +47,6 @@ __getattr__ = late(
         "read_pose_graph write_pose_graph": "vislam.batch.posegraph.files",
         "PoseGraphSolution optimize_pose_graph": "vislam.batch.posegraph.optimize",
         "PoseGraphProblem": "vislam.batch.posegraph.problem",
-        "simulate_graph write_simulated": "vislam.batch.posegraph.worlds",
+        "SimulatedGraph false_loops measured_graph simulate_graph write_simulated": "vislam.batch.posegraph.worlds",
     },
 )

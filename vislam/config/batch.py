@@ -22,7 +22,7 @@ class PoseGraphConfig:
     """Optimisation of a pose graph from a file."""
 
     start: Literal["auto", "file", "odometry", "tree", "chordal", "angles", "grown"] = (
-        "auto"  # auto: the one of lowest cost
+        "auto"  # auto: the one of lowest cost; all of them where it ends above what noise allows
     )
     method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
     equations: Literal["auto", "cholesky", "gradients"] = "auto"  # conjugate gradients where a factor would be large

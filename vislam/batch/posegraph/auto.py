@@ -1,14 +1,16 @@
 """Which loops of a pose graph to believe, without a given method: several are tried, evidence decides.
 
-Robust kernels of several shapes and scales, and gates that let loops in one by one, lead from odometry to solutions in
-different places. Each is settled by `Judge`, which lets loops in and takes them back until all agree, and they are
-compared by their marginal likelihood. Where two solutions contradict each other and the places that speak for one are
+All edges, graduated non-convexity, and robust kernels of several shapes and scales lead to solutions in different
+places. Each is settled by `Judge`, which lets loops in and takes them back until all agree, and they are compared by
+their marginal likelihood. Loops within the noise stated, which only the smaller noise of the others speaks against, are
+kept as its tails. Where two solutions contradict each other and the places that speak for one are
 not clearly more than those that speak for the other, or where a cluster of loops is confirmed by nothing else and
 hardly likelier true than false, nothing is decided: such loops stay out, and are named.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,12 +21,14 @@ from scipy.spatial import cKDTree
 
 from vislam.batch.posegraph.gnc import doubtful_edges, joining_edges, reject_false_edges
 from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
+from vislam.batch.posegraph.plain import solve
 from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
 from vislam.batch.posegraph.robust import Kernel, kernel_route
 from vislam.batch.posegraph.solver import Progress, levenberg_marquardt
-from vislam.batch.posegraph.starts import odometry_start
+from vislam.batch.posegraph.starts import chordal_start, odometry_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
+from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
 
 Mask = NDArray[np.bool_]
@@ -35,12 +39,17 @@ _ROUTES: tuple[tuple[Kernel, float], ...] = (
 )  # fmt: skip
 _IN = 0.25  # weight under a kernel from which on a loop is among those that are judged first
 _KERNEL_QUANTILE = 0.05  # where one kernel alone is asked for
+_BEYOND_SHARE = 0.01  # of loops beyond what noise allows, up to which all may be true
+_TAILS = 16.0  # times the limit of a loop within the noise stated, with the noise that others show
+_MORE_OFTEN = 1.5  # loops of the place seen most often, over those of any that is lost
+_ITERATIONS, _TOLERANCE = 20, 1e-5
 _SETTLED_MAX = 2  # solutions in different places that are followed to their end
 _OVERSTATED = 0.1  # of the stated variances: where loops show less, all are rescaled before judging
+_NUMBERS_MIN = 30  # redundant ones, to show it
 _SAME_PLACE = 0.02  # of the extent: solutions that differ by less, rms, are one
 _CLEAR = 1.5  # witnesses of a solution over those of its rival
 _APART = 8.0  # log-likelihood between them, below which witnesses do not matter
-_GAIN_MIN = 16.0  # of the objective, per number of a pose: what a solution must explain beyond odometry alone
+_GAIN_MIN = 6.0  # of the objective: what a solution must explain beyond odometry alone, if all others contradict it
 _ALONE = 0.5  # leverage from which on nothing else confirms a loop
 _THIN = 4.0  # log-odds of a cluster that stands alone, below which it is not believed
 _NAMED = 5  # clusters in a message
@@ -49,32 +58,25 @@ _NAMED = 5  # clusters in a message
 def decide(problem: PoseGraphProblem, config: PoseGraphConfig, progress: Progress | None = None) -> Decision:
     """Return what evidence decides about the loops. Raises UsageError where the factor does not fit into memory.
 
-    Variances that are stated far too large hide all evidence. So where nothing is decided, and loops that the gates of
-    `reject_false_edges` take fit much better than stated, it is asked again with their scale.
+    Variances that are stated far too large hide all evidence. So where loops that graduated non-convexity believes fit
+    much better than stated, all is judged with their scale.
     """
-    decision = _decide(problem, config, progress)
-    loops = doubtful_edges(problem)
-    if not loops.any() or decision.weights[loops].any():
-        return decision
-    weights = reject_false_edges(Structure(problem), config, progress)
-    kept = problem.with_edges(weights > 0.0)
-    structure = Structure(kept)
-    numbers = (len(kept.edges) - len(structure.free)) * problem.tangent
-    if numbers <= 0:
-        return decision
-    ones = np.ones(len(kept.edges))
-    fitted = levenberg_marquardt(
-        structure, odometry_start(problem, structure.anchors), ones, iterations=20, tolerance=1e-6
-    )
-    scale = fitted.costs[-1] / numbers
-    if not 0.0 < scale < _OVERSTATED:
-        return decision
-    again = _decide(replace(problem, information=problem.information / scale), config, progress)
-    reason = f"{again.reason}; these on top of all variances times {scale:.3g}, which loops near odometry show"
-    return replace(again, reason=reason) if again.weights[loops].any() else decision
+    structure = Structure(problem, config.equations)
+    weights, poses = reject_false_edges(structure, config.inlier_probability, progress)
+    numbers = (int(weights.sum()) - len(structure.free)) * problem.tangent
+    scale = problem.chi2(poses, weights) / max(numbers, 1)
+    reason = ""
+    if numbers >= _NUMBERS_MIN and 0.0 < scale < _OVERSTATED:
+        problem = replace(problem, information=problem.information / scale)
+        reason = f"; these on top of all variances times {scale:.3g}, which loops show"
+    decision = _decide(structure, problem, Decision(poses, weights, "graduated non-convexity"), config, progress)
+    return replace(decision, reason=decision.reason + reason)
 
 
-def _decide(problem: PoseGraphProblem, config: PoseGraphConfig, progress: Progress | None) -> Decision:
+def _decide(
+    structure: Structure, problem: PoseGraphProblem, gnc: Decision, config: PoseGraphConfig, progress: Progress | None
+) -> Decision:
+    """Return what evidence decides about the loops of `problem`, the structure's with noise that fits."""
     trusted = ~doubtful_edges(problem)
     trusted |= joining_edges(problem, trusted)
     chain = problem.with_edges(trusted)
@@ -82,31 +84,73 @@ def _decide(problem: PoseGraphProblem, config: PoseGraphConfig, progress: Progre
     if trusted.all():
         return Decision(None, np.ones(len(trusted)), "there are no loops to doubt")
     judge = Judge(problem, trusted, odometry, config.inlier_probability)
-    found = _solutions(problem, judge, trusted, odometry, progress)
+    plain = _plain(structure, config, trusted, progress)
+    found = _solutions(problem, judge, trusted, _routes(problem, trusted, odometry, plain, gnc, progress))
+    loops = np.flatnonzero(~trusted)
     (best_name, best), rivals = found[0], found[1:]
     alone, _ = judge.objective(odometry, trusted)
     gain = alone - best.objective
-    loops = np.flatnonzero(~trusted)
-    held = int(best.kept[loops].sum())
-    if held == 0 or gain < _GAIN_MIN:
+    held, lost = best.kept & ~trusted, ~best.kept
+    if not held.any() or not _is_enough(problem, judge, gain, held, lost):
         warning = (
-            f"it is undecided which of the {len(loops)} loops are true: none is believed, odometry alone is the answer"
+            f"it is undecided which of the {len(loops)} loops are true: {_contest(problem, judge, held, lost)}; none "
+            "is believed, odometry alone is the answer"
         )
         return Decision(odometry, trusted.astype(np.float64), "odometry alone", loops, warning)
-    kept, poses = best.kept.copy(), best.poses
-    disputed = _disputed(problem, best, rivals)
-    thin = _thin(problem, best, trusted)
+    tails = lost & _tails(structure.problem, problem, best, plain, config)
+    kept, poses = best.kept | tails, best.poses
+    disputed = _disputed(judge, best, rivals)
+    thin = _thin(problem, best, trusted) & bool(np.any(lost & ~tails))
     undecided = np.flatnonzero(disputed | thin)
     kept[undecided] = False
-    if np.any(disputed | thin):
+    if np.any(disputed | thin | tails):
         _, poses = judge.objective(poses, kept)
     reason = (
-        f"{best_name}: {held} of {len(loops)} loops agree with odometry and each other"
+        f"{best_name}: {(kept & ~trusted).sum()} of {len(loops)} loops agree with odometry and each other"
         f" (log-likelihood {0.5 * gain:.4g} above odometry alone"
         + "".join(f"; {name} {0.5 * (j.objective - best.objective):.4g} below" for name, j in rivals[:2])
         + f"); variances of odometry {best.odometry_scale:.3g}, of loops {best.loop_scale:.3g} times those stated"
     )
     return Decision(poses, kept.astype(np.float64), reason, undecided, _warning(problem, disputed, thin))
+
+
+def _plain(structure: Structure, config: PoseGraphConfig, trusted: Mask, progress: Progress | None) -> Array | None:
+    """Return the optimum of all edges, if loops are off by no more than what is stated of their noise allows."""
+    problem = structure.problem
+    poses = solve(structure, config, progress).descent.poses
+    beyond = problem.edge_chi2(poses)[~trusted] > chi_square_limit(config.inlier_probability, problem.tangent)
+    return poses if beyond.mean() <= _BEYOND_SHARE else None
+
+
+def _tails(
+    stated: PoseGraphProblem, problem: PoseGraphProblem, best: Judgement, plain: Array | None, config: PoseGraphConfig
+) -> Mask:
+    """Return edges [E] that only noise smaller than stated, as others show it, speaks against.
+
+    Where all edges lead to the same place as the best of them, those within the noise stated are its tails. Otherwise
+    those that also are not too far off for what others show.
+    """
+    limit = chi_square_limit(config.inlier_probability, problem.tangent)
+    if plain is not None and _same(problem, plain, best.poses):
+        return stated.edge_chi2(plain) <= limit
+    shown = problem.edge_chi2(best.poses) / best.loop_scale
+    return (stated.edge_chi2(best.poses) <= limit) & (shown > limit) & (shown <= _TAILS * limit)
+
+
+def _is_enough(problem: PoseGraphProblem, judge: Judge, gain: float, held: Mask, lost: Mask) -> bool:
+    """Return whether the loops held [E] are to be believed, given their gain and those that contradict them.
+
+    Chance makes single loops agree with odometry, so the more are lost, the more the others must explain. But it does
+    not make a place seen so much more often than any that is lost.
+    """
+    true, false = judge.witnesses(held), judge.witnesses(lost)
+    seen_more = _largest(problem, held) >= _MORE_OFTEN * _largest(problem, lost)
+    return seen_more or gain >= _GAIN_MIN * false / (true + false)
+
+
+def _largest(problem: PoseGraphProblem, edges: Mask) -> int:
+    """Return how many loops the largest cluster of edges [E] has."""
+    return int(np.bincount(_clusters(problem, np.flatnonzero(edges)), minlength=1).max())
 
 
 def decide_by_kernel(problem: PoseGraphProblem, kernel: Kernel, progress: Progress | None = None) -> Decision:
@@ -125,21 +169,15 @@ def decide_by_kernel(problem: PoseGraphProblem, kernel: Kernel, progress: Progre
 
 
 def _solutions(
-    problem: PoseGraphProblem, judge: Judge, trusted: Mask, odometry: Array, progress: Progress | None
+    problem: PoseGraphProblem, judge: Judge, trusted: Mask, routes: Iterable[tuple[str, Array, Mask]]
 ) -> list[tuple[str, Judgement]]:
     """Return settled solutions in different places, the likeliest first, with the names of what led to them."""
-    errors = problem.edge_chi2(odometry)[~trusted]
     first: list[tuple[float, str, Array, Mask]] = []
-    for kernel, quantile in _ROUTES:
-        scale = float(np.quantile(errors, quantile))
-        led_to = kernel_route(problem, trusted, odometry, kernel, scale, len(first) > 0, progress)
-        if led_to is None:
-            continue
-        poses, weights = led_to
-        kept = trusted | (weights >= _IN)
-        objective, poses = judge.objective(poses, kept)
-        first.append((objective, f"{kernel} from the nearest {quantile:.0%}", poses, kept))
-        if len(first) == 2 and _same(problem, first[0][2], poses):
+    for name, end, kept in routes:
+        objective, poses = judge.objective(_lowest(problem, end, kept), kept)
+        agrees = np.any(kept & ~trusted) and any(_same(problem, poses, other) for _, _, other, _ in first)
+        first.append((objective, name, poses, kept))
+        if agrees:
             break
     first.sort(key=lambda entry: entry[0])
     settled: list[tuple[str, Judgement]] = []
@@ -151,9 +189,42 @@ def _solutions(
             continue
         tried.append(poses)
         _add(problem, settled, name, judge.settle(poses, kept))
-    if len(tried) > 1:  # kernels disagree: ask the gates too
-        _add(problem, settled, "gates from odometry", judge.settle(odometry, trusted))
-    return sorted(settled, key=lambda entry: entry[1].objective)
+    return sorted(settled, key=lambda entry: (not np.any(entry[1].kept & ~trusted), entry[1].objective))
+
+
+def _routes(
+    problem: PoseGraphProblem,
+    trusted: Mask,
+    odometry: Array,
+    plain: Array | None,
+    gnc: Decision,
+    progress: Progress | None,
+) -> Iterator[tuple[str, Array, Mask]]:
+    """Yield names, poses and edges kept of what one route after the other leads to."""
+    if plain is not None:
+        yield "all edges", plain, np.ones_like(trusted)
+    assert gnc.poses is not None
+    yield gnc.reason, gnc.poses, gnc.weights > 0.0
+    errors = problem.edge_chi2(odometry)[~trusted]
+    for kernel, quantile in _ROUTES:
+        scale = float(np.quantile(errors, quantile))
+        led_to = kernel_route(problem, trusted, odometry, kernel, scale, True, progress)
+        if led_to is not None:
+            poses, weights = led_to
+            yield f"{kernel} from the nearest {quantile:.0%}", poses, trusted | (weights >= _IN)
+
+
+def _lowest(problem: PoseGraphProblem, poses: Array, kept: Mask) -> Array:
+    """Return the optimum of lower cost of the edges kept: that near poses, or that near the chordal relaxation.
+
+    A route that ends with true loops alone may still have gone into another valley than theirs.
+    """
+    structure, ones = Structure(problem.with_edges(kept)), np.ones(int(kept.sum()))
+    ends = [
+        levenberg_marquardt(structure, start, ones, iterations=_ITERATIONS, tolerance=_TOLERANCE)
+        for start in (poses, chordal_start(structure, ones))
+    ]
+    return min(ends, key=lambda end: end.costs[-1]).poses
 
 
 def _add(problem: PoseGraphProblem, settled: list[tuple[str, Judgement]], name: str, judgement: Judgement) -> None:
@@ -172,13 +243,15 @@ def _same(problem: PoseGraphProblem, one: Array, other: Array) -> bool:
     return apart <= _SAME_PLACE * extent(problem, one)
 
 
-def _disputed(problem: PoseGraphProblem, best: Judgement, rivals: list[tuple[str, Judgement]]) -> Mask:
+def _disputed(judge: Judge, best: Judgement, rivals: list[tuple[str, Judgement]]) -> Mask:
     """Return edges [E] over which a rival contradicts the best solution, where the places do not clearly decide."""
     out = np.zeros(len(best.kept), dtype=np.bool_)
     for _, rival in rivals:
         ours, theirs = best.kept & ~rival.kept, rival.kept & ~best.kept
         apart = 0.5 * (rival.objective - best.objective)
-        if apart < _APART or _witnesses(problem, ours) < _CLEAR * _witnesses(problem, theirs):
+        if not theirs.any():
+            continue  # it believes less, and contradicts nothing
+        if apart < _APART or judge.witnesses(ours) < _CLEAR * judge.witnesses(theirs):
             out |= ours | theirs
     return out
 
@@ -203,11 +276,12 @@ def _clusters(problem: PoseGraphProblem, at: NDArray[np.int64]) -> NDArray[np.in
     return connected_components(joined, directed=False)[1].astype(np.int64)
 
 
-def _witnesses(problem: PoseGraphProblem, edges: Mask) -> int:
-    """Return how many clusters edges [E] form, each counted once per place: witnesses independent of each other."""
-    at = np.flatnonzero(edges)
-    cluster, first = _clusters(problem, at), problem.edges[at].min(axis=1, initial=len(problem.ids))
-    return int(sum(1 + np.ptp(first[cluster == c]) // PLACE for c in range(int(cluster.max(initial=-1)) + 1)))
+def _contest(problem: PoseGraphProblem, judge: Judge, held: Mask, lost: Mask) -> str:
+    """Return between what it is undecided."""
+    if not held.any():
+        return f"none of {judge.witnesses(lost)} places agrees with odometry"
+    agree, others = judge.witnesses(held), judge.witnesses(lost)
+    return f"loops of {agree} places agree with odometry and each other, those of {others} with neither"
 
 
 def _warning(problem: PoseGraphProblem, disputed: Mask, thin: Mask) -> str:

@@ -44,21 +44,25 @@ def doubtful_edges(problem: PoseGraphProblem) -> Mask:
     return np.abs(problem.edges[:, 1] - problem.edges[:, 0]) != 1
 
 
-def reject_false_edges(structure: Structure, config: PoseGraphConfig, progress: Progress | None = None) -> Array:
-    """Return the weights [E] of edges: 1 kept, 0 rejected. Edges between successive ids are never doubted.
+def reject_false_edges(
+    structure: Structure, probability: float, progress: Progress | None = None
+) -> tuple[Array, Array]:
+    """Return the weights [E] of edges, 1 kept, 0 rejected, and poses near their optimum.
+
+    Edges between successive ids are never doubted.
 
     Where these leave the graph in parts, as few others as join it are believed too.
     """
     problem = structure.problem
     trusted = ~doubtful_edges(problem)
     trusted |= joining_edges(problem, trusted)
-    limit = chi_square_limit(config.inlier_probability, problem.tangent)
+    limit = chi_square_limit(probability, problem.tangent)
     poses, candidates, scale = _gated(problem, trusted, limit, progress)
     weights = candidates.astype(np.float64)
-    weights[candidates] = graduated_non_convexity(
+    weights[candidates], poses = graduated_non_convexity(
         Structure(problem.with_edges(candidates)), poses, trusted[candidates], TAILS * limit * scale, progress
     )
-    return weights
+    return weights, poses
 
 
 def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraphConfig) -> Array:
@@ -67,7 +71,7 @@ def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraph
     For a problem whose poses are good already, as those of sessions that several loops agreed to bring together.
     """
     limit = TAILS * chi_square_limit(config.inlier_probability, problem.tangent)
-    return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)
+    return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)[0]
 
 
 def joining_edges(problem: PoseGraphProblem, trusted: Mask) -> Mask:
@@ -162,8 +166,10 @@ def _tested(
 
 def graduated_non_convexity(
     structure: Structure, poses: Array, trusted: Mask, limit: float | Array, progress: Progress | None = None
-) -> Array:
+) -> tuple[Array, Array]:
     """Return the weights [E], 0 or 1, that minimise the least squares, truncated at `limit`, of what is not trusted.
+
+    With them the poses that the last step ended with.
 
     `limit` is one for all edges or has one for each [E].
 
@@ -172,7 +178,7 @@ def graduated_non_convexity(
     problem = structure.problem
     weights = np.ones(len(problem.edges))
     if trusted.all():
-        return weights
+        return weights, poses
     errors = problem.edge_chi2(poses)
     limits = np.broadcast_to(np.asarray(limit, dtype=np.float64), errors.shape)[~trusted]
     control = float(np.min(limits / np.maximum(2.0 * errors[~trusted] - limits, limits)))
@@ -186,7 +192,7 @@ def graduated_non_convexity(
             break
         control *= _GROWTH
     weights[~trusted] = errors[~trusted] <= limits
-    return weights
+    return weights, poses
 
 
 def _weights(errors: Array, limit: Array, control: float) -> Array:

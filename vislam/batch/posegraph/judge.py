@@ -41,6 +41,7 @@ _SAMPLE = 150  # edges of each kind whose covariances show the scales
 _CALIBRATIONS = 4
 _SETTLED = 0.2  # of the logarithm of a scale
 _SCALE_MIN, _ODOMETRY_SCALE_MAX, _LOOP_SCALE_MAX = 1e-10, 4.0, 1.0
+_LOOPS_BETTER = 0.1  # of odometry's scale: less shows loops that were made of odometry, or agree by chance
 _SHARE_MIN = 0.1  # redundancy of odometry over its numbers: below, loops say little about its noise
 _REDUNDANCY_MIN = 5.0
 _LEVERAGE_MAX = 1.0 - 1e-9
@@ -90,7 +91,7 @@ class Judge:
         stale, score, share = np.ones(len(at), dtype=np.bool_), np.zeros(len(at)), np.zeros(len(at))
         times_out = np.zeros(len(at))
         for _ in range(_ROUNDS_MAX):
-            structure, poses, scales, _ = self._calibrated(poses, kept, scales)
+            structure, poses, scales = self._calibrated(poses, kept, scales)
             if _apart(scales, judged_with) > _SETTLED or changed > _CHANGED * kept[at].sum():
                 stale[:], changed, judged_with = True, 0, scales
             weights = (self._counts_for(kept) / self._variances(scales))[kept]
@@ -111,15 +112,19 @@ class Judge:
             kept[at[leaves]], kept[at[enters]] = False, True
             changed += int(np.sum(leaves | enters))
             stale = leaves | enters | (np.abs(score) < _BORDER)
-        _, poses, scales, objective = self._calibrated(poses, kept, scales)
+        _, poses, scales = self._calibrated(poses, kept, scales)
         evidence, leverage = np.full(len(kept), np.inf), np.zeros(len(kept))
         evidence[at], leverage[at] = score + _ODDS, np.where(kept[at], share, 0.0)
-        return Judgement(poses, kept, *scales, objective, evidence, leverage)
+        return Judgement(poses, kept, *scales, self._likelihood(poses, kept, scales), evidence, leverage)
 
     def objective(self, poses: Array, kept: Mask) -> tuple[float, Array]:
         """Return the objective (see `Judgement`) of edges kept [E] and their optimum near poses."""
-        _, poses, _, objective = self._calibrated(poses, kept, (1.0, 1.0))
-        return objective, poses
+        _, poses, scales = self._calibrated(poses, kept, (1.0, 1.0))
+        return self._likelihood(poses, kept, scales), poses
+
+    def witnesses(self, edges: Mask) -> int:
+        """Return how many loops among edges [E] are witnesses independent of each other: one per pair of places."""
+        return len(self._one_per_place(self._loops[edges[self._loops]]))
 
     def _variances(self, scales: tuple[float, float]) -> Array:
         return np.where(self._trusted, scales[0], scales[1])
@@ -135,12 +140,12 @@ class Judge:
         """Return how many of the loops [M] (indices of edges) join the same two places as each, itself among them."""
         if not len(loops):
             return np.ones(0)
-        ends = self._at[np.sort(self._problem.edges[loops], axis=1)].reshape(-1, 4)
+        ends = self._ends(loops)
         return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
 
     def _calibrated(
         self, poses: Array, kept: Mask, scales: tuple[float, float]
-    ) -> tuple[Structure, Array, tuple[float, float], float]:
+    ) -> tuple[Structure, Array, tuple[float, float]]:
         """Return the optimum of the edges kept, with variances scaled by what their residuals show."""
         edges = np.flatnonzero(kept)
         structure, trusted = Structure(self._problem.with_edges(edges)), self._trusted[edges]
@@ -150,19 +155,41 @@ class Judge:
             variances = self._variances(scales)
             weights = (counts_for / variances)[edges]
             poses = levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
-            S, log_determinant = covariances_of_edges(structure, self._problem, poses, weights, sample, kept[sample])
+            S, _ = covariances_of_edges(structure, self._problem, poses, weights, sample, kept[sample])
             z, L = self._whitened(poses, S, variances, sample)
             before, scales = scales, self._scales(z, L, counts_for[sample], sample, scales)
             if _apart(scales, before) < _SETTLED:
                 break
-        squares = np.sum(self._errors(poses, variances, edges) ** 2, axis=1)
-        terms = squares + self._dof[edges] * np.log(variances[edges]) - np.log(self._values[edges]).sum(axis=1)
-        terms *= counts_for[edges]
-        rest = self._loops[~kept[self._loops]]
-        share, held = self._share(kept), float(counts_for[edges[~trusted]].sum())
-        lost = float(np.sum(1.0 / self._alike(rest)))
-        rate = -2.0 * (held * math.log(share) + lost * math.log(1.0 - share))
-        return structure, poses, scales, float(terms.sum()) + log_determinant + rate
+        return structure, poses, scales
+
+    def _likelihood(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> float:
+        """Return the objective (see `Judgement`), near poses, of odometry and one kept loop of each two places."""
+        rest = self._one_per_place(self._loops[~kept[self._loops]])
+        held = self._one_per_place(self._loops[kept[self._loops]])
+        edges, variances = np.sort(np.concatenate([np.flatnonzero(self._trusted), held])), self._variances(scales)
+        structure, weights = Structure(self._problem.with_edges(edges)), 1.0 / variances[edges]
+        poses = levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
+        none = edges[:0]
+        _, log_determinant = covariances_of_edges(structure, self._problem, poses, weights, none, self._trusted[none])
+        terms = np.sum(self._errors(poses, variances, edges) ** 2, axis=1)
+        terms += self._dof[edges] * np.log(variances[edges]) - np.log(self._values[edges]).sum(axis=1)
+        share = (len(held) + 1.0) / (len(held) + len(rest) + 2.0)
+        rate = -2.0 * (len(held) * math.log(share) + len(rest) * math.log(1.0 - share))
+        return float(terms.sum()) + log_determinant + rate
+
+    def _one_per_place(self, loops: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return some of the loops (indices of edges), the first of each two places that none before it joins."""
+        ends = self._ends(loops)
+        tree, open_, chosen = cKDTree(ends), np.ones(len(loops), dtype=np.bool_), []
+        for i in range(len(loops)):
+            if open_[i]:
+                chosen.append(i)
+                open_[tree.query_ball_point(ends[i], 1.0, p=np.inf)] = False
+        return loops[chosen]
+
+    def _ends(self, loops: NDArray[np.int64]) -> Array:
+        """Return where both ends of loops [M] are, in places [M, 4]."""
+        return self._at[np.sort(self._problem.edges[loops], axis=1)].reshape(-1, 4)
 
     def _scales(
         self, z: Array, L: Array, counts_for: Array, edges: NDArray[np.int64], scales: tuple[float, float]
@@ -179,7 +206,7 @@ class Judge:
             loops *= float(np.median(studentised / self._medians[edges][judged]))
         return (
             min(max(odometry, _SCALE_MIN), _ODOMETRY_SCALE_MAX),
-            min(max(loops, _SCALE_MIN), _LOOP_SCALE_MAX),
+            min(max(loops, _LOOPS_BETTER * min(odometry, 1.0), _SCALE_MIN), _LOOP_SCALE_MAX),
         )
 
     def _scores(self, poses: Array, kept: Mask, scales: tuple[float, float], S: Array) -> tuple[Array, Array]:

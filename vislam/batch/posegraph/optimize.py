@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +10,14 @@ from numpy.typing import NDArray
 
 from vislam.batch.posegraph.auto import decide, decide_by_kernel
 from vislam.batch.posegraph.gnc import reject_false_edges
-from vislam.batch.posegraph.growing import grown_start
+from vislam.batch.posegraph.plain import Plain, descend, solve
 from vislam.batch.posegraph.problem import Decision, Ids, PoseGraphProblem
 from vislam.batch.posegraph.sightings import reject_false_sightings, undetermined_landmarks, undetermined_message
-from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
-from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
+from vislam.batch.posegraph.solver import Progress
+from vislam.batch.posegraph.starts import file_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
-from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Array
 
 _BEYOND_MIN, _BEYOND_SHARE = 2, 0.01  # loops beyond what noise allows, which one in a thousand is, to be warned of
@@ -75,24 +73,25 @@ def optimize_pose_graph(
         weights = decision.weights
         structure = Structure(problem.with_edges(weights != 0.0), config.equations)
     if decision is not None and decision.poses is not None and config.start == "auto":
-        start_name, start = "robust", decision.poses
-        start_costs = {start_name: structure.problem.chi2(start)}
+        costs = {"robust": structure.problem.chi2(decision.poses)}
+        plain = Plain("robust", decision.poses, costs, descend(structure, decision.poses, config, progress), "")
     else:
-        start_name, start, start_costs = _start(structure, config)
-    descent = _descend(structure, start, config, progress)
-    parts = structure.parts
+        plain = solve(structure, config, progress)
+    parts, descent = structure.parts, plain.descent
     notes = [*problem.notes, *_of_landmarks(problem, descent.poses, weights)]
     if config.robust != "auto":
         notes += _of_loops(problem, descent.poses, weights, config.inlier_probability)
     if decision is not None and decision.warning:
         notes.append(decision.warning)
+    if plain.note:
+        notes.append(plain.note)
     if parts > 1:
         notes.append(f"{parts} parts that no edge joins, each with a pose of its own that keeps its value")
     if not descent.converged:
         notes.append("not converged: give more --iterations, another --start or --method")
     return PoseGraphSolution(
-        descent.poses, start, start_name, start_costs, descent.costs, descent.converged, weights, structure.anchors,
-        parts, tuple(notes), time.process_time() - begun,
+        descent.poses, plain.start, plain.start_name, plain.start_costs, descent.costs, descent.converged, weights,
+        structure.anchors, parts, tuple(notes), time.process_time() - begun,
         "" if decision is None else decision.reason, () if decision is None else tuple(decision.undecided.tolist()),
     )  # fmt: skip
 
@@ -118,7 +117,8 @@ def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress 
         return decide(structure.problem, config, progress)
     if config.robust in ("cauchy", "geman-mcclure", "dcs"):
         return decide_by_kernel(structure.problem, config.robust, progress)
-    return Decision(None, reject_false_edges(structure, config, progress), "graduated non-convexity, as asked for")
+    weights, _ = reject_false_edges(structure, config.inlier_probability, progress)
+    return Decision(None, weights, "graduated non-convexity, as asked for")
 
 
 def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> list[str]:
@@ -146,54 +146,3 @@ def _of_loops(problem: PoseGraphProblem, poses: Array, weights: Array, probabili
             "than odometry; --robust auto judges this"
         )
     return notes
-
-
-def _start(structure: Structure, config: PoseGraphConfig) -> tuple[str, Array, dict[str, float]]:
-    """Return the name, the poses and the costs of the starts asked for; of several the one of lowest cost."""
-    problem = structure.problem
-    ones = np.ones(len(problem.edges))
-    makers: dict[str, Callable[[], Array]] = {
-        "chordal": lambda: chordal_start(structure, ones),
-        "angles": lambda: angles_start(structure, ones),
-        "tree": lambda: tree_start(problem, structure.anchors),
-        "odometry": lambda: odometry_start(problem, structure.anchors),
-        "file": lambda: file_start(problem),
-        "grown": lambda: grown_start(problem),
-    }
-    if problem.dimension == 3:
-        del makers["angles"]
-    if config.start != "auto" and config.start not in makers:
-        raise UsageError(f"start '{config.start}' is for graphs in the plane; for this one: {', '.join(makers)}")
-    if config.start != "auto":
-        makers = {config.start: makers[config.start]}
-    elif not problem.has_pose.any():
-        del makers["file"]
-    if config.start == "auto" and not problem.is_point.any():
-        del makers["grown"]  # as dear as solving, and among poses alone the linear starts are good
-    best: tuple[float, str, Array] | None = None
-    costs: dict[str, float] = {}
-    for name, make in makers.items():
-        poses = make()
-        poses[problem.is_point, :-1, :-1] = np.eye(problem.dimension)
-        costs[name] = problem.chi2(poses)
-        if np.isfinite(costs[name]) and (best is None or costs[name] < best[0]):
-            best = (costs[name], name, poses)
-    if best is None:
-        raise DataError("the graph has no finite cost at any start; are its measurements too large?")
-    return best[1], best[2], costs
-
-
-def _descend(structure: Structure, start: Array, config: PoseGraphConfig, progress: Progress | None) -> Descent:
-    problem, weights = structure.problem, np.ones(len(structure.problem.edges))
-    if config.method in ("lm", "dogleg"):
-        native = levenberg_marquardt if config.method == "lm" else dogleg
-        return native(
-            structure, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
-        )  # fmt: skip
-    from vislam.batch.posegraph.gtsam import gtsam_levenberg_marquardt, isam2_replay
-
-    if config.method == "isam2":
-        return isam2_replay(problem, start, weights, progress=progress)
-    return gtsam_levenberg_marquardt(
-        problem, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
-    )  # fmt: skip

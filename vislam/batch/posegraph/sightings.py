@@ -47,7 +47,7 @@ def reject_false_sightings(
     degrees = np.where(problem.is_position, problem.dimension, problem.tangent)
     limits = {int(k): TAILS * chi_square_limit(config.inlier_probability, int(k)) for k in np.unique(degrees)}
     limit = np.array([limits[k] for k in degrees.tolist()])
-    weights = graduated_non_convexity(Structure(problem), poses, ~doubted, limit, progress)
+    weights, _ = graduated_non_convexity(Structure(problem), poses, ~doubted, limit, progress)
     return Decision(
         poses, weights, f"grown under Cauchy's kernel, then {config.robust}", warning=_lost(problem, weights)
     )

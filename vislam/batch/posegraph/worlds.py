@@ -51,9 +51,16 @@ def simulate_graph(shape: Shape, world: GraphWorldConfig) -> SimulatedGraph:
     rng = np.random.default_rng(world.seed)
     truth = _PATHS[shape](world.poses, rng)
     d = truth.shape[1] - 1
-    odometry = np.column_stack([np.arange(world.poses - 1), np.arange(1, world.poses)])
     loops = _near_pairs(truth[:, :d, d], round(world.loops_per_pose * world.poses), rng)
-    false, shift = _false_pairs(truth, world, len(loops), rng)
+    return measured_graph(truth, loops, world, rng)
+
+
+def measured_graph(truth: Array, loops: Ids, world: GraphWorldConfig, rng: np.random.Generator) -> SimulatedGraph:
+    """Measure odometry along true poses [N, d + 1, d + 1] and true loops [L, 2] between them, and add false ones."""
+    d = truth.shape[1] - 1
+    odometry = np.column_stack([np.arange(len(truth) - 1), np.arange(1, len(truth))])
+    count = round(world.outlier_fraction / (1.0 - world.outlier_fraction) * len(loops))
+    false, shift = false_loops(truth, count, world.alias_group, rng)
     edges = np.concatenate([odometry, loops, false])
     between = invert_many(truth[edges[:, 0]]) @ truth[edges[:, 1]]
     if len(false):
@@ -64,9 +71,9 @@ def simulate_graph(shape: Shape, world: GraphWorldConfig) -> SimulatedGraph:
     order = np.lexsort((edges[:, 0], kind, edges[:, 1]))
     problem = PoseGraphProblem(
         dimension=d,
-        ids=np.arange(world.poses),
+        ids=np.arange(len(truth)),
         poses=_chained(truth[0], measured[: len(odometry)]),
-        fixed=np.zeros(world.poses, dtype=bool),
+        fixed=np.zeros(len(truth), dtype=bool),
         edges=np.ascontiguousarray(edges[order]),
         measurements=np.ascontiguousarray(measured[order]),
         information=np.tile(np.diag(sigma**-2.0), (len(edges), 1, 1)),
@@ -159,19 +166,26 @@ def _near_pairs(positions: Array, wanted: int, rng: np.random.Generator) -> Ids:
     return pairs if len(pairs) <= wanted else pairs[np.sort(rng.choice(len(pairs), wanted, replace=False))]
 
 
-def _false_pairs(truth: Array, world: GraphWorldConfig, true_loops: int, rng: np.random.Generator) -> tuple[Ids, Array]:
-    """Return pairs [F, 2] that look like one place, and the world's motion [F, d + 1, d + 1] of each."""
-    n, size, d = len(truth), world.alias_group, truth.shape[1] - 1
-    count = round(world.outlier_fraction / (1.0 - world.outlier_fraction) * true_loops)
+def false_loops(
+    truth: Array, count: int, size: int, rng: np.random.Generator, apart_m: float = _FALSE_M
+) -> tuple[Ids, Array]:
+    """Return pairs [count, 2] that look like one place, and the world's motion [count, d + 1, d + 1] of each.
+
+    Those of a group of `size` join successive poses and agree; all poses [N, d + 1, d + 1] joined are `apart_m` apart.
+    Raises UsageError where the poses have no room for them.
+    """
+    n, d = len(truth), truth.shape[1] - 1
     groups = -(-count // size)
+    if size > n:
+        raise UsageError(f"{n} poses have no room for false loops in groups of {size}")
     starts = np.sort(rng.integers(0, n - size + 1, size=(8 * groups + 64, 2)), axis=1)
     ends = starts[:, None, :] + np.arange(size)[None, :, None]  # [C, group, 2]
     apart = np.linalg.norm(truth[ends[..., 0], :d, d] - truth[ends[..., 1], :d, d], axis=2).min(axis=1)
-    good = (apart > _FALSE_M) & (starts[:, 1] - starts[:, 0] >= size)
+    good = (apart > apart_m) & (starts[:, 1] - starts[:, 0] >= size)
     starts, ends = starts[good][:groups], ends[good][:groups]
     if len(starts) < groups:
         raise UsageError(
-            f"{n} poses have no room for {count} false loops in groups of {size} between places {_FALSE_M:g} m apart; "
+            f"{n} poses have no room for {count} false loops in groups of {size} between places {apart_m:g} m apart; "
             "more poses, or fewer of them"
         )
     shift = truth[starts[:, 0]] @ invert_many(truth[starts[:, 1]])

@@ -1,0 +1,124 @@
+"""The plain answer to a pose graph: from which start, and how the cost descends from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vislam.batch.posegraph.growing import grown_start
+from vislam.batch.posegraph.priors import onto_priors
+from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
+from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
+from vislam.batch.posegraph.structure import Structure
+from vislam.config import PoseGraphConfig
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array
+
+_NOISE_ALLOWS = 0.999  # chance of a cost below what is not doubted
+_SAME_COST = 1e-4  # relative: descents that end this near each other agree
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plain:
+    """The answer that believes all edges."""
+
+    start_name: str
+    start: Array  # [N, d + 1, d + 1]
+    start_costs: dict[str, float]  # of each start that was tried
+    descent: Descent
+    note: str  # how many starts led here, where several were solved
+
+
+def solve(structure: Structure, config: PoseGraphConfig, progress: Progress | None = None) -> Plain:
+    """Return the lowest cost that the method finds from the start asked for, or from the cheapest of all.
+
+    A start of low cost may lie in a wrong valley. So where the cost that it leads to is more than noise allows, the
+    other starts are solved too.
+    """
+    starts, costs = _starts(structure, config)
+    order = sorted(starts, key=costs.__getitem__)
+    descents = {order[0]: descend(structure, starts[order[0]], config, progress)}
+    if len(order) > 1 and config.method in ("lm", "dogleg") and _is_doubtful(structure, descents[order[0]].costs[-1]):
+        descents |= {name: descend(structure, starts[name], config, progress) for name in order[1:]}
+    best = min(descents, key=lambda name: descents[name].costs[-1])
+    lowest, note = descents[best].costs[-1], ""
+    if len(descents) > 1:
+        agree = sum(d.costs[-1] <= lowest * (1.0 + _SAME_COST) for d in descents.values())
+        note = f"the cost is more than noise allows: {len(descents)} starts were solved, {agree} end with this cost"
+    return Plain(best, starts[best], costs, descents[best], note)
+
+
+def _is_doubtful(structure: Structure, cost: float) -> bool:
+    """Return whether a cost is more than the noise stated allows, of a graph with anything redundant."""
+    problem, free = structure.problem, structure.free
+    measured = np.where(problem.is_position, problem.dimension, problem.tangent).sum()
+    unknown = np.where(problem.is_point[free], problem.dimension, problem.tangent).sum()
+    redundant = int(measured - unknown)
+    return redundant > 0 and cost > chi_square_limit(_NOISE_ALLOWS, redundant)
+
+
+def _starts(structure: Structure, config: PoseGraphConfig) -> tuple[dict[str, Array], dict[str, float]]:
+    """Return the poses [N, d + 1, d + 1] of the starts asked for that have a finite cost, and the costs of all."""
+    problem = structure.problem
+    names = ["chordal", "angles", "tree", "odometry", "file", "grown"]
+    if problem.dimension == 3:
+        names.remove("angles")
+    if config.start != "auto" and config.start not in names:
+        raise UsageError(f"start '{config.start}' is for graphs in the plane; for this one: {', '.join(names)}")
+    if config.start != "auto":
+        names = [config.start]
+    elif not problem.has_pose.any():
+        names.remove("file")
+    if config.start == "auto" and not problem.is_point.any():
+        names.remove("grown")  # as dear as solving, and among poses alone the linear starts are good
+    relative = structure
+    if problem.world >= 0:
+        relative = Structure(problem.with_edges(problem.edges[:, 0] != problem.world), config.equations)
+    starts: dict[str, Array] = {}
+    costs: dict[str, float] = {}
+    for name in names:
+        made = [_make(name, structure)]
+        if relative is not structure:
+            made.append(onto_priors(problem, _make(name, relative) if name != "grown" else made[0]))
+        for poses in made:
+            poses[problem.is_point, :-1, :-1] = np.eye(problem.dimension)
+            cost = problem.chi2(poses)
+            if name not in costs or cost < costs[name]:
+                costs[name], starts[name] = cost, poses
+    starts = {name: poses for name, poses in starts.items() if np.isfinite(costs[name])}
+    if not starts:
+        raise DataError("the graph has no finite cost at any start; are its measurements too large?")
+    return starts, costs
+
+
+def _make(name: str, structure: Structure) -> Array:
+    """Return the poses [N, d + 1, d + 1] of one start."""
+    problem, ones = structure.problem, np.ones(len(structure.problem.edges))
+    if name == "chordal":
+        return chordal_start(structure, ones)
+    if name == "angles":
+        return angles_start(structure, ones)
+    if name == "tree":
+        return tree_start(problem, structure.anchors)
+    if name == "odometry":
+        return odometry_start(problem, structure.anchors)
+    return file_start(problem) if name == "file" else grown_start(problem)
+
+
+def descend(structure: Structure, start: Array, config: PoseGraphConfig, progress: Progress | None) -> Descent:
+    """Return where the method that was asked for leads from `start` [N, d + 1, d + 1], all edges believed."""
+    problem, weights = structure.problem, np.ones(len(structure.problem.edges))
+    if config.method in ("lm", "dogleg"):
+        native = levenberg_marquardt if config.method == "lm" else dogleg
+        return native(
+            structure, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
+        )  # fmt: skip
+    from vislam.batch.posegraph.gtsam import gtsam_levenberg_marquardt, isam2_replay
+
+    if config.method == "isam2":
+        return isam2_replay(problem, start, weights, progress=progress)
+    return gtsam_levenberg_marquardt(
+        problem, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
+    )  # fmt: skip
