@@ -2,6 +2,7 @@
 
     .venv/bin/python benchmarks/pose_graph.py FILE.g2o ...
     .venv/bin/python benchmarks/pose_graph.py landmarks     # Victoria Park of the installed gtsam
+    .venv/bin/python benchmarks/pose_graph.py commands FILE.g2o ... --record   # whole commands, into docs/batch.md
     .venv/bin/python benchmarks/pose_graph.py growth --sizes 1000 10000 100000 --picture growth.png
 
 Each peer runs in a process of its own, reads the file, solves and writes a g2o file; times are its CPU seconds, the
@@ -13,7 +14,9 @@ loads compiled code, does not count. g2o and Ceres come from wheels that are no 
 
     pip install --no-deps --target FOLDER g2opy pyceres     # then --peers FOLDER
 
-Without them their rows say that they are missing, as do those of a peer that fails.
+A whole command is a process from its start to its end: of ours, `vislam posegraph` with what it reports by default, and
+with the optimum alone. Without the wheels their rows
+say that they are missing, as do those of a peer that fails.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -48,6 +52,8 @@ from vislam.batch.posegraph.worlds import simulate_graph  # noqa: E402
 from vislam.config import GraphWorldConfig, PoseGraphConfig  # noqa: E402
 from vislam.core.errors import VislamError  # noqa: E402
 
+PAGE = ROOT / "docs" / "batch.md"
+COMMANDS = {"vislam": (), "optimum alone": ("--no-noise", "--no-certify", "--no-report")}
 PEER = ROOT / "benchmarks" / "peers" / "pose_graph_peer.py"
 OURS, PEERS = "vislam", ("vislam", "gtsam_lm", "gtsam_chordal_lm", "g2o_lm", "ceres_lm")
 # SE-Sync's published costs (IJRR 2019); where the tables lack a file, of a run of its program
@@ -120,6 +126,36 @@ def compare(files: list[Path], limit_s: float, folder: Path, wheels: str, rounds
     return cpu_ms
 
 
+def commands(files: list[Path], limit_s: float, folder: Path, wheels: str, rounds: int) -> dict[str, float]:
+    """Return CPU ms of whole commands, ours and the peers', the least of the rounds, of which the first compiles."""
+    cpu_ms: dict[str, float] = {}
+    for source in files:
+        for _ in range(rounds):
+            for name in (*COMMANDS, *PEERS[1:]):
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                if name in COMMANDS:
+                    command = [sys.executable, "-m", "vislam", "posegraph", str(source), "--out", str(folder / "out")]
+                    subprocess.run([*command, *COMMANDS[name]], cwd=ROOT, capture_output=True, check=True)
+                elif "reason" in run_peer(name, source, folder / "out.g2o", limit_s, wheels):
+                    continue
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                spent = 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+                metric = f"{source.stem}, whole command, {name}"
+                cpu_ms[metric] = min(spent, cpu_ms.get(metric, spent))
+    return cpu_ms
+
+
+def table_of_commands(cpu_ms: dict[str, float]) -> str:
+    """Return a table of whole commands in CPU seconds, a row for each file."""
+    names = (*COMMANDS, *PEERS[1:])
+    files = dict.fromkeys(metric.split(", ")[0] for metric in cpu_ms if ", whole command, " in metric)
+    rows = [["CPU [s]", *names], ["---", *["---:"] * len(names)]]
+    for file in files:
+        times = [cpu_ms.get(f"{file}, whole command, {name}") for name in names]
+        rows.append([file, *("" if time is None else f"{1e-3 * time:.2f}" for time in times)])
+    return "".join(f"|{'|'.join(row)}|\n" for row in rows)
+
+
 def growth(
     shapes: list[str], sizes: list[int], loops: float, limit_s: float, folder: Path, picture: Path | None
 ) -> None:
@@ -188,7 +224,9 @@ def draw(rows: list[dict[str, Any]], picture: Path) -> None:
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+", help="g2o files, or one of the words growth, landmarks")
+    parser.add_argument(
+        "files", nargs="+", help="g2o files, also behind the word commands; or one of the words growth, landmarks"
+    )
     parser.add_argument("--limit-s", type=float, default=600.0, help="of a peer on a file")
     parser.add_argument("--shapes", nargs="+", default=["manhattan", "torus", "sphere", "grid3d"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[1000, 3000, 10000, 30000, 100000])
@@ -204,6 +242,13 @@ def main() -> None:
             growth(args.shapes, args.sizes, args.loops_per_pose, args.limit_s, folder, args.picture)
         elif args.files == ["landmarks"]:
             landmarks()
+        elif args.files[0] == "commands":
+            cpu_ms = commands([Path(f) for f in args.files[1:]], args.limit_s, folder, args.peers, args.rounds)
+            print(table_of_commands(cpu_ms))
+            if args.record:
+                kept = results.read(results.record("pose_graph", cpu_ms)).cpu_ms
+                page = results.with_table(PAGE.read_text(encoding="utf-8"), table_of_commands(kept), PAGE.name)
+                PAGE.write_text(page, encoding="utf-8")
         else:
             cpu_ms = compare([Path(file) for file in args.files], args.limit_s, folder, args.peers, args.rounds)
             if args.record:

@@ -198,12 +198,12 @@ def table(folder: Path = FOLDER) -> str:
     return "\n".join(lines) + "\n"
 
 
-def with_table(page: str, rows: str) -> str:
-    """Return a page whose block between the markers is a table."""
+def with_table(page: str, rows: str, name: str = str(PAGE)) -> str:
+    """Return a page whose block between the markers is a table; raises DataError, with its name, where it has none."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise DataError(f"{PAGE} has no lines {BEGIN} and {END}")
+        raise DataError(f"{name} has no lines {BEGIN} and {END}")
     return f"{before}{BEGIN}\n{rows}{END}{after}"
 
 

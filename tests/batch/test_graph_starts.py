@@ -11,6 +11,7 @@ from vislam.batch.posegraph.optimize import optimize_pose_graph
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import levenberg_marquardt
 from vislam.batch.posegraph.structure import Structure
+from vislam.config import PoseGraphConfig
 
 
 def in_the_world(seed):
@@ -68,6 +69,16 @@ def test_the_optimum_is_found_wherever_the_world_is(seeds):
         if not found <= best * (1.0 + 1e-4):
             missed.append((seed, best, found))
     assert not missed
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_starts_of_exact_measurements_lie_on_the_priors(seed):
+    graph, truth = in_the_world(seed)
+    d, measurements = graph.dimension, np.linalg.inv(truth[graph.edges[:, 0]]) @ truth[graph.edges[:, 1]]
+    measurements[graph.is_position, :d, :d] = np.eye(d)
+    exact = replace(graph, measurements=np.ascontiguousarray(measurements))
+    for start in ("chordal", "tree", "odometry"):
+        assert optimize_pose_graph(exact, PoseGraphConfig(start=start)).start_costs[start] < 1e-6
 
 
 def test_starts_that_end_elsewhere_are_counted():
