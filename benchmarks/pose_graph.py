@@ -15,8 +15,7 @@ loads compiled code, does not count. g2o and Ceres come from wheels that are no 
     pip install --no-deps --target FOLDER g2opy pyceres     # then --peers FOLDER
 
 A whole command is a process from its start to its end: of ours, `vislam posegraph` with what it reports by default, and
-with the optimum alone. Without the wheels their rows
-say that they are missing, as do those of a peer that fails.
+with the optimum alone. Without the wheels their rows say that they are missing, as do those of a peer that fails.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 All edges, graduated non-convexity, and robust kernels of several shapes and scales lead to solutions in different
 places. Each is settled by `Judge`, which lets loops in and takes them back until all agree, and they are compared by
 their marginal likelihood. Loops within the noise stated, which only the smaller noise of the others speaks against, are
-kept as its tails. Where two solutions contradict each other and the places that speak for one are
-not clearly more than those that speak for the other, or where a cluster of loops is confirmed by nothing else and
-hardly likelier true than false, nothing is decided: such loops stay out, and are named.
+kept as its tails. Where two solutions contradict each other and the places that speak for one are not clearly more than
+those that speak for the other, or where a cluster of loops is confirmed by nothing else and hardly likelier true than
+false, nothing is decided: such loops stay out, and are named.
 """
 
 from __future__ import annotations

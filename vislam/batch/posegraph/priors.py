@@ -14,10 +14,7 @@ def onto_priors(problem: PoseGraphProblem, poses: Array) -> Array:
     Positions and rotations are fitted together, weighted by the traces of their information: the rotation is the polar
     factor of the sum of both (Umeyama, PAMI 1991, with rotations as further vectors).
     """
-    d, world = problem.dimension, problem.world
-    if world < 0:
-        return poses
-    of_world = problem.edges[:, 0] == world
+    d, of_world = problem.dimension, problem.edges[:, 0] == problem.world
     labels = problem.with_edges(~of_world).components()
     held = np.unique(labels[problem.fixed])
     out, at = poses.copy(), np.flatnonzero(of_world & ~np.isin(labels[problem.edges[:, 1]], held))
