@@ -3,17 +3,16 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
-import time
 from contextlib import closing
 
 import psutil
 import pytest
 from tiny import write_plan
 
-from vislam.core.errors import UsageError
+from dask_cluster import PATIENCE_S, dask_cluster, until
+from vislam import VislamError
 from vislam.experiment.engines import run_locally, run_on_dask
 from vislam.experiment.isolated import run_isolated
 from vislam.experiment.jobs import expand
@@ -21,22 +20,10 @@ from vislam.experiment.plan import load_plan
 from vislam.experiment.store import ResultStore
 from vislam.experiment.worker import run_job
 
-PATIENCE_S = 1800.0  # a busy machine is no failure; nothing waits so long otherwise
-
 
 @pytest.fixture
 def specs(tmp_path):
     return [job.spec() for job in expand(load_plan(write_plan(tmp_path)))]
-
-
-def until(condition, what):
-    """Wait until a condition holds and return its value."""
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s:
-        if value := condition():
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"waited in vain for {what}")
 
 
 def workers_of(process):
@@ -107,43 +94,9 @@ def test_no_job_outlives_the_process_that_asked_for_it(specs, tmp_path):
     until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE, "the orphan to end")
 
 
-def start_dask_worker(address, name, folder):
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
-    options = ["--name", name, "--local-directory", str(folder), "--no-dashboard", "--host", "127.0.0.1"]
-    with (folder / f"{name}.txt").open("wb") as said:
-        return subprocess.Popen([*command, *options], stdout=said, stderr=said)
-
-
-@pytest.fixture
-def cluster(tmp_path):
-    """A real scheduler and two worker processes on loopback; yields its address and the workers by name."""
-    distributed = pytest.importorskip("distributed")
-    file = tmp_path / "scheduler.json"
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
-    with (tmp_path / "scheduler.txt").open("wb") as said:
-        scheduler = subprocess.Popen(
-            [*command, "--no-dashboard", "--scheduler-file", str(file)], stdout=said, stderr=said
-        )
-    processes = [scheduler]
-    try:
-        until(lambda: file.is_file() and file.stat().st_size > 0, "the scheduler")
-        address = json.loads(file.read_text())["address"]
-        workers = {name: start_dask_worker(address, name, tmp_path) for name in ("one", "two")}
-        processes += workers.values()
-        with distributed.Client(address, timeout=PATIENCE_S) as client:
-            client.wait_for_workers(2, timeout=PATIENCE_S)
-        yield address, workers
-    finally:
-        for process in processes:
-            if process.poll() is None:
-                process.kill()
-            process.wait()
-
-
-def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, cluster, tmp_path):
-    (address, workers), specs = cluster, specs[:2]
-    finished = []
-    with ResultStore(tmp_path / "r.db") as store:
+def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, tmp_path):
+    specs, finished = specs[:2], []
+    with dask_cluster(tmp_path) as (address, workers), ResultStore(tmp_path / "r.db") as store:
         thread, _ = in_thread(lambda: finished.extend(run_on_dask(specs, address, tmp_path, None)))
         victim = psutil.Process(workers["one"].pid)
         job = until(lambda: workers_of(victim), "the worker to begin a job")[0]
@@ -165,9 +118,9 @@ def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, cluste
 
 
 def test_a_cluster_that_is_not_there_is_one_line(specs, tmp_path, monkeypatch):
-    monkeypatch.setattr("vislam.experiment.engines._ANSWER_S", 0.5)
-    with pytest.raises(UsageError, match="no Dask scheduler answers at 'tcp://127"):
+    monkeypatch.setattr("vislam.core.cluster._ANSWER_S", 0.5)
+    with pytest.raises(VislamError, match="no Dask scheduler answers at 'tcp://127"):
         list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=r"pip install '\.\[cluster\]'"):
+    with pytest.raises(VislamError, match=r"pip install '\.\[cluster\]'"):
         list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))

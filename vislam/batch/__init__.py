@@ -20,14 +20,17 @@ if TYPE_CHECKING:
         simulate_graph,
         write_simulated,
     )
+    from vislam.core.cluster import DaskTeam, dask_client
 
 __all__ = [
     "BatchResult",
+    "DaskTeam",
     "LoopVerdict",
     "PoseGraphFile",
     "PoseGraphProblem",
     "PoseGraphSolution",
     "SimulatedGraph",
+    "dask_client",
     "false_loops",
     "measured_graph",
     "optimize_pose_graph",
@@ -42,6 +45,7 @@ __getattr__ = late(
     __name__,
     {
         "BatchResult optimize_run": "vislam.batch.bundle.bundle_adjustment",
+        "DaskTeam dask_client": "vislam.core.cluster",
         "LoopVerdict": "vislam.batch.bundle.loops",
         "PoseGraphFile": "vislam.batch.posegraph.graph_file",
         "read_pose_graph write_pose_graph": "vislam.batch.posegraph.files",

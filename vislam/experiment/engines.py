@@ -8,10 +8,8 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from vislam.core.errors import UsageError, install_line
+from vislam.core.cluster import dask_client
 from vislam.experiment.isolated import run_isolated
-
-_ANSWER_S = 20.0  # a scheduler that is there answers much sooner
 
 Spec = dict[str, Any]
 Result = dict[str, Any]
@@ -41,22 +39,16 @@ def run_on_dask(specs: Sequence[Spec], scheduler: str, cache: Path, keep: Path |
     Workers need this very version of vislam and the same paths to the recordings. A job that took several workers
     down with it is a failed result. Raises UsageError without Dask or without a scheduler at that address.
     """
-    try:
-        import distributed
-    except ImportError as error:
-        raise UsageError(f"--engine dask needs the extra 'cluster': {install_line('cluster')}") from error
-    try:
-        client = distributed.Client(scheduler, timeout=_ANSWER_S)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise UsageError(f"no Dask scheduler answers at '{scheduler}': {error}; start one: dask scheduler") from error
-    with client:
+    with dask_client(scheduler, 0) as client:
+        from distributed import as_completed as finished_first
+
         kept = None if keep is None else str(keep)
         futures = {
             client.submit(run_isolated, spec, str(cache), kept, key=f"vislam-{spec['key']}", pure=False): spec
             for spec in specs
         }
         try:
-            for future in distributed.as_completed(list(futures), raise_errors=False):
+            for future in finished_first(list(futures), raise_errors=False):
                 yield futures[future], _outcome(future)
         finally:
             client.cancel(list(futures))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from vislam.core.collector import paused
 from vislam.core.errors import DataError
 from vislam.core.files import write_text
 from vislam.core.geometry import quaternion_xyzw_from_rotation
@@ -43,13 +44,14 @@ def read_tum(path: Path) -> Trajectory:
     return _trajectory(t_ns, numbers[:, 0:3], numbers[:, 3:7], path, lines)
 
 
+@paused()
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write a TUM file with exact nanoseconds; the file appears whole or not at all. Raises StorageError."""
-    q = _quaternions_xyzw(trajectory)
+    q, row = _quaternions_xyzw(trajectory), "%s%d.%09d" + " %.9f" * 7 + "\n"
     rows = ["# t_s tx ty tz qx qy qz qw\n"]
     for t_ns, p, o in zip(trajectory.t_ns.tolist(), trajectory.positions_m.tolist(), q.tolist(), strict=True):
         sign, (seconds, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
-        rows.append(f"{sign}{seconds}.{fraction:09d} " + " ".join(f"{value:.9f}" for value in (*p, *o)) + "\n")
+        rows.append(row % (sign, seconds, fraction, *p, *o))
     write_text(path, "".join(rows))
 
 
@@ -72,10 +74,12 @@ def read_kitti(path: Path, times: Path | NDArray[np.int64]) -> Trajectory:
     return Trajectory(t_ns, poses)
 
 
+@paused()
 def write_kitti(trajectory: Trajectory, path: Path) -> None:
     """Write a KITTI pose file; the format holds no times. Raises StorageError."""
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12).tolist()
-    write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
+    row = " ".join(["%.12g"] * 12) + "\n"
+    write_text(path, "".join(row % tuple(numbers) for numbers in rows))
 
 
 def read_euroc(path: Path) -> Trajectory:

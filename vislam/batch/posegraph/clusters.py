@@ -33,7 +33,7 @@ class Clusters:
         """
         both = np.flatnonzero((ends >= 0).all(axis=1))
         a, b = np.ascontiguousarray(ends[both].T)
-        self.of = _grown(*adjacency(count, a, b), size)  # [n]
+        self.of = grown(*adjacency(count, a, b), size)  # [n]
         _, self.first = np.unique(self.of, return_index=True)  # a pose of each cluster
         inside = self.of[a] == self.of[b]
         local = np.full(ends.shape, _NONE, dtype=np.int64)
@@ -61,38 +61,58 @@ class _Joins(NamedTuple):
     pair_later: Ints
 
 
-class ClusteredSolver:
-    """Solves one system after another of the structure of its clusters, with blocks of size d, as `Factor` does."""
+class RigidMotions:
+    """Solves one system after another for the best motion of each cluster as a whole, with blocks of size d."""
 
-    def __init__(self, clusters: Clusters, d: int, tolerance: float) -> None:
-        """Allocate both levels. Steps end when the preconditioned residual is this share of what it was."""
-        self._clusters, self._tolerance = clusters, tolerance
+    def __init__(self, clusters: Clusters, d: int) -> None:
+        """Allocate what all systems share."""
+        self.clusters, self._factor = clusters, Factor(clusters.coarse, d)
         self.later_is_to = clusters.local.later_is_to
-        self._local, self._coarse = Factor(clusters.local, d), Factor(clusters.coarse, d)
-        self.steps = 0  # of the last solution
 
     def factorise(self, diagonal: Array, off: Array, motions: Array) -> bool:
         """Prepare for a matrix in blocks as `Factor` has them; False where it is not positive definite.
 
         `motions` [n, d, d]: what a motion of a pose's cluster as a whole is as a motion of the pose.
         """
-        c = self._clusters
-        self._diagonal, self._off, self._motions = diagonal, off, motions
+        c, self._motions = self.clusters, motions
         coarse = np.zeros((len(c.first), *diagonal.shape[1:]))
         coarse_off = np.zeros((len(c.pair_later), *diagonal.shape[1:]))
         joins = _Joins(c.of, c.later, c.earlier, c.edges, c.pair, c.pair_later)
         _project(joins, motions, diagonal, off, coarse, coarse_off)
-        return self._local.factorise(diagonal, off) and self._coarse.factorise(coarse, coarse_off)
+        return self._factor.factorise(coarse, coarse_off)
+
+    def solve(self, rhs: Array) -> Array:
+        """Return x [n, d] among the motions of whole clusters for which what is left of A @ x = rhs moves none."""
+        of = self.clusters.of
+        gathered = np.zeros((len(self.clusters.first), rhs.shape[1]))
+        np.add.at(gathered, of, np.einsum("nba,nb->na", self._motions, rhs))
+        return np.asarray(np.einsum("nab,nb->na", self._motions, self._factor.solve(gathered)[of]))
+
+
+class ClusteredSolver:
+    """Solves one system after another of the structure of its clusters, with blocks of size d, as `Factor` does."""
+
+    def __init__(self, clusters: Clusters, d: int, tolerance: float) -> None:
+        """Allocate both levels. Steps end when the preconditioned residual is this share of what it was."""
+        self.clusters, self._tolerance = clusters, tolerance
+        self.later_is_to = clusters.local.later_is_to
+        self._local, self._rigid = Factor(clusters.local, d), RigidMotions(clusters, d)
+        self.steps = 0  # of the last solution
+
+    def factorise(self, diagonal: Array, off: Array, motions: Array) -> bool:
+        """Prepare for a matrix in blocks; see `RigidMotions`."""
+        self._diagonal, self._off = diagonal, off
+        return self._local.factorise(diagonal, off) and self._rigid.factorise(diagonal, off, motions)
 
     def solve(self, rhs: Array) -> Array:
         """Return x [n, d] with A @ x = rhs [n, d] nearly."""
-        c = self._clusters
+        c = self.clusters
         x, r, Ap = np.zeros_like(rhs), rhs.copy(), np.empty_like(rhs)
         z = self._preconditioned(r)
         p, rz = z.copy(), float(np.vdot(r, z))
         end = self._tolerance**2 * rz
         for self.steps in range(1, _STEPS_MAX + 1):
-            _multiply(self._diagonal, self._off, c.later, c.earlier, c.edges, p, Ap)
+            multiply(self._diagonal, self._off, c.later, c.earlier, c.edges, p, Ap)
             curvature = float(np.vdot(p, Ap))
             if not curvature > 0.0:
                 break
@@ -107,15 +127,11 @@ class ClusteredSolver:
         return x
 
     def _preconditioned(self, r: Array) -> Array:
-        c = self._clusters
-        gathered = np.zeros((len(c.first), r.shape[1]))
-        np.add.at(gathered, c.of, np.einsum("nba,nb->na", self._motions, r))
-        moved = self._coarse.solve(gathered)
-        return self._local.solve(r) + np.einsum("nab,nb->na", self._motions, moved[c.of])
+        return self._local.solve(r) + self._rigid.solve(r)
 
 
 @njit(cache=True, nogil=True)
-def _grown(begins: Ints, neighbours: Ints, size: int) -> Ints:
+def grown(begins: Ints, neighbours: Ints, size: int) -> Ints:
     """Return the cluster [n] of each node: grown by breadth to `size` nodes, each beside those before it."""
     n = len(begins) - 1
     cluster = np.full(n, _NONE, dtype=np.int64)
@@ -187,7 +203,7 @@ def _joined(begins: Ints, neighbours: Ints, cluster: Ints, counts: Ints, least: 
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _multiply(diagonal: Array, off: Array, later: Ints, earlier: Ints, edges: Ints, x: Array, out: Array) -> None:
+def multiply(diagonal: Array, off: Array, later: Ints, earlier: Ints, edges: Ints, x: Array, out: Array) -> None:
     """Write A @ x into out [n, d]."""
     d = x.shape[1]
     for i in range(len(x)):

@@ -27,6 +27,7 @@ from vislam.batch.posegraph.parts import (
 )
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.tagged_lines import Rows, TaggedLines, read_tagged_lines
+from vislam.core.collector import paused
 from vislam.core.errors import DataError
 from vislam.core.files import write_text
 from vislam.core.messages import Array
@@ -76,6 +77,7 @@ def read_g2o(path: Path, repair: bool = False) -> PoseGraphProblem:
     return extras.marked(problem).noted(passed_over)
 
 
+@paused()
 def write_g2o(problem: PoseGraphProblem, path: Path, poses: Array | None = None) -> None:
     """Write a problem with 15 digits, with `poses` [N, d + 1, d + 1] in the place of its own.
 
@@ -105,11 +107,12 @@ def _edge_lines(problem: PoseGraphProblem, row: str) -> Iterator[str]:
     digits = " ".join(["%.15g"] * len(a))
     texts: dict[bytes, str] = {}  # most files repeat a few matrices
     ends, measured = problem.ids[problem.edges[own]].tolist(), pose_numbers(problem.measurements[own]).tolist()
-    for (i, j), numbers, information in zip(ends, measured, upper, strict=True):
-        key = information.tobytes()
-        if key not in texts:
-            texts[key] = digits % tuple(information.tolist())
-        yield row % (i, j, *numbers, texts[key])
+    stated, size = upper.tobytes(), upper.itemsize * len(a)
+    matrices = [stated[at : at + size] for at in range(0, len(stated), size)]
+    for (i, j), numbers, matrix in zip(ends, measured, matrices, strict=True):
+        if matrix not in texts:
+            texts[matrix] = digits % tuple(np.frombuffer(matrix).tolist())
+        yield row % (i, j, *numbers, texts[matrix])
 
 
 def _poses_3d(path: Path, rows: Rows) -> Array:

@@ -57,7 +57,7 @@ def _with_more(
     if not last:
         is_in &= joined == joined[int(np.argmax(problem.is_pose))]
     edges = edges[is_in[problem.edges[edges]].all(axis=1)]
-    part = _part(problem, np.flatnonzero(is_in), edges)
+    part = part_of(problem, np.flatnonzero(is_in), edges)
     known = poses[is_in]
     start = file_start(part.with_poses(np.where(np.isnan(known), part.poses if last else np.nan, known)))
     start[part.is_point, :-1, :-1] = np.eye(problem.dimension)
@@ -73,7 +73,7 @@ def _with_more(
     return out
 
 
-def _part(problem: PoseGraphProblem, poses: Ids, edges: Ids) -> PoseGraphProblem:
+def part_of(problem: PoseGraphProblem, poses: Ids, edges: Ids) -> PoseGraphProblem:
     """Return the problem of some poses and edges between them."""
     place = np.full(len(problem.ids), -1, dtype=np.int64)
     place[poses] = np.arange(len(poses))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.batch.posegraph.auto import decide, decide_by_kernel
+from vislam.batch.posegraph.domains import Team, solve_by_domains
 from vislam.batch.posegraph.gnc import reject_false_edges
 from vislam.batch.posegraph.plain import Plain, descend, solve
 from vislam.batch.posegraph.problem import Decision, Ids, PoseGraphProblem
@@ -18,6 +19,7 @@ from vislam.batch.posegraph.starts import file_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
+from vislam.core.errors import UsageError
 from vislam.core.messages import Array
 
 _BEYOND_MIN, _BEYOND_SHARE = 2, 0.01  # loops beyond what noise allows, which one in a thousand is, to be warned of
@@ -56,28 +58,33 @@ class PoseGraphSolution:
 
 
 def optimize_pose_graph(
-    problem: PoseGraphProblem, config: PoseGraphConfig | None = None, progress: Progress | None = None
+    problem: PoseGraphProblem,
+    config: PoseGraphConfig | None = None,
+    progress: Progress | None = None,
+    team: Team | None = None,
 ) -> PoseGraphSolution:
     """Return the poses of lowest chi2 (see `PoseGraphProblem`) that the method finds from the chosen start.
 
     One pose of each connected part keeps its value, fixed poses all do. Deterministic. Raises DataError when the graph
     has no finite cost anywhere or the method fails, UsageError for a start that the graph cannot have, and where the
-    search for false edges needs a factor that does not fit.
+    search for false edges needs a factor that does not fit. `team`: who solves the graph by overlapping domains; None:
+    it is solved as a whole.
     """
     config = config or PoseGraphConfig()
     begun = time.process_time()
-    structure, decision = Structure(problem, config.equations), None
-    weights = np.ones(len(problem.edges))
+    weights, decision, kept = np.ones(len(problem.edges)), None, problem
     if config.robust != "none":
-        decision = _decision(structure, config, progress)
+        decision = _decision(Structure(problem, config.equations), config, progress)
         weights = decision.weights
-        structure = Structure(problem.with_edges(weights != 0.0), config.equations)
-    if decision is not None and decision.poses is not None and config.start == "auto":
-        costs = {"robust": structure.problem.chi2(decision.poses)}
-        plain = Plain("robust", decision.poses, costs, descend(structure, decision.poses, config, progress), "")
-    else:
-        plain = solve(structure, config, progress)
-    parts, descent = structure.parts, plain.descent
+        kept = problem.with_edges(weights != 0.0)
+    decided = None if decision is None or config.start != "auto" else decision.poses
+    plain = (
+        _as_a_whole(kept, decided, config, progress)
+        if team is None
+        else _by_domains(kept, decided, config, progress, team)
+    )
+    labels, descent = kept.components(), plain.descent
+    parts = int(labels.max(initial=-1)) + 1
     notes = [*problem.notes, *_of_landmarks(problem, descent.poses, weights)]
     if config.robust != "auto":
         notes += _of_loops(problem, descent.poses, weights, config.inlier_probability)
@@ -91,9 +98,38 @@ def optimize_pose_graph(
         notes.append("not converged: give more --iterations, another --start or --method")
     return PoseGraphSolution(
         descent.poses, plain.start, plain.start_name, plain.start_costs, descent.costs, descent.converged, weights,
-        structure.anchors, parts, tuple(notes), time.process_time() - begun,
+        kept.anchors_of(labels), parts, tuple(notes), time.process_time() - begun,
         "" if decision is None else decision.reason, () if decision is None else tuple(decision.undecided.tolist()),
     )  # fmt: skip
+
+
+def _as_a_whole(
+    problem: PoseGraphProblem, decided: Array | None, config: PoseGraphConfig, progress: Progress | None
+) -> Plain:
+    """Return the answer that believes all edges, from the poses [N, d + 1, d + 1] that were `decided` if there are."""
+    structure = Structure(problem, config.equations)
+    if decided is None:
+        return solve(structure, config, progress)
+    return Plain(
+        "robust", decided, {"robust": problem.chi2(decided)}, descend(structure, decided, config, progress), ""
+    )
+
+
+def _by_domains(
+    problem: PoseGraphProblem, decided: Array | None, config: PoseGraphConfig, progress: Progress | None, team: Team
+) -> Plain:
+    """Return the same, solved by domains. Raises UsageError for what they cannot."""
+    if not problem.of_poses:
+        raise UsageError("domains are of poses alone, but this graph has landmarks or priors: solve it as a whole")
+    if config.method != "lm" or config.start not in ("auto", "file"):
+        raise UsageError("domains are solved with --method lm and --start auto or file, or else the graph as a whole")
+    name, start = ("domains", None) if decided is None else ("robust", decided)
+    if config.start == "file":
+        name, start = "file", file_start(problem)
+    start, descent = solve_by_domains(
+        problem, team, iterations=config.iterations, tolerance=config.tolerance, start=start, progress=progress
+    )
+    return Plain(name, start, {name: descent.costs[0]}, descent, "")
 
 
 def as_stated(problem: PoseGraphProblem, weights: NDArray[np.float64]) -> tuple[Array, float] | None:

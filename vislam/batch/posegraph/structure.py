@@ -9,10 +9,10 @@ import numpy as np
 
 from vislam.batch.posegraph.arithmetic import Edges, Normal, linearise_2d, linearise_3d, retract_2d, retract_3d
 from vislam.batch.posegraph.cholesky import Factor
-from vislam.batch.posegraph.clusters import ClusteredSolver, Clusters
+from vislam.batch.posegraph.clusters import ClusteredSolver, Clusters, RigidMotions, multiply
 from vislam.batch.posegraph.points import PositionEdges
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
-from vislam.batch.posegraph.symbolic import FACTOR_MAX_BYTES, analyse
+from vislam.batch.posegraph.symbolic import FACTOR_MAX_BYTES, Symbolic, analyse
 from vislam.core.errors import UsageError
 from vislam.core.geometry import invert_many
 from vislam.core.messages import Array
@@ -43,7 +43,11 @@ class Structure:
         self.index = np.full(len(problem.ids), -1, dtype=np.int64)  # [N] place among the free poses
         self.index[self.free] = np.arange(len(self.free))
         self.ends = self.index[problem.edges]
-        self.symbolic = analyse(len(self.free), *np.ascontiguousarray(self.ends.T))
+
+    @cached_property
+    def symbolic(self) -> Symbolic:
+        """How a factor eliminates the free poses."""
+        return analyse(len(self.free), *np.ascontiguousarray(self.ends.T))
 
     def factor(self, d: int) -> Factor:
         """Return a factor for blocks of size d. Raises UsageError where it does not fit into memory."""
@@ -78,8 +82,8 @@ class Structure:
 class NormalEquations:
     """The normal equations of a problem at some poses, in blocks: H = J^T W J and the gradient J^T W r."""
 
-    def __init__(self, structure: Structure, solver: Factor | ClusteredSolver) -> None:
-        """Allocate room for them; `solver` is one of the structure's, for blocks of the tangents' size."""
+    def __init__(self, structure: Structure, solver: Factor | ClusteredSolver | RigidMotions) -> None:
+        """Allocate room for them; `solver` is one of the structure's free poses, for blocks of the tangents' size."""
         self._structure, self._solver = structure, solver
         n, k, m = len(structure.free), structure.problem.tangent, len(structure.problem.edges)
         self.diagonal = np.zeros((n, k, k))
@@ -109,13 +113,17 @@ class NormalEquations:
         diagonal = self.damped(damping)
         if isinstance(self._solver, Factor):
             return self._solver.factorise(diagonal, self.off)
-        clusters, at = self._structure.clusters, self._poses[self._structure.free]
+        clusters, at = self._solver.clusters, self._poses[self._structure.free]
         motions = adjoints(invert_many(at) @ at[clusters.first[clusters.of]])
         return self._solver.factorise(diagonal, self.off, motions)
 
     def step(self) -> Array:
         """Return the Newton step [n, k] of the equations as last prepared."""
         return self._solver.solve(-self.gradient)
+
+    def rest(self, step: Array) -> Array:
+        """Return what the solver adds to a step [n, k] that is no solution of the equations yet."""
+        return self._solver.solve(-self.gradient - self.product(step))
 
     def damped(self, damping: float) -> Array:
         """Return the diagonal blocks [n, k, k], their diagonals enlarged by this share of themselves (Marquardt)."""
@@ -130,13 +138,16 @@ class NormalEquations:
 
     def curvature(self, step: Array) -> float:
         """Return step^T H step of a step [n, k]."""
-        s = self._structure
-        total = float(np.einsum("na,nab,nb->", step, self.diagonal, step, optimize=True))
+        return float(np.vdot(step, self.product(step)))
+
+    def product(self, step: Array) -> Array:
+        """Return H @ step [n, k]."""
+        s, out = self._structure, np.empty_like(step)
         both = np.flatnonzero((s.ends >= 0).all(axis=1))
         to = self._solver.later_is_to[both]
         later, earlier = np.where(to, s.ends[both, 1], s.ends[both, 0]), np.where(to, s.ends[both, 0], s.ends[both, 1])
-        cross = np.einsum("eb,eba,ea->", step[earlier], self.off[both], step[later], optimize=True)
-        return total + 2.0 * float(cross)
+        multiply(self.diagonal, self.off, later, earlier, both, step, out)
+        return out
 
     def retract(self, poses: Array, step: Array, out: Array) -> None:
         """Write poses @ Exp(step) into out; step [n, k] is of the free poses."""

@@ -22,7 +22,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.core.reading import open_file
 
-_MAX_BYTES = 512 * 2**20  # a million edges in space with all digits; ten times as much memory at worst
+_MAX_BYTES = 2 * 2**30  # five million edges in space with all digits; ten times as much memory at worst
 _MAX_TAG_BYTES = 32
 _SHOWN = 40  # characters of what is wrong
 _TOO_FEW, _TOO_MANY, _NOT_NUMBER, _NOT_ID, _NOT_FINITE = range(1, 6)

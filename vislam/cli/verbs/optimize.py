@@ -13,6 +13,7 @@ from tyro.conf import Positional
 from vislam.cli.verbs import posegraph
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.results import print_evaluation
+from vislam.cli.verbs.solving import SolvingOptions
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import BatchConfig
 from vislam.core.errors import TrackingLostError, UsageError, printable
@@ -27,6 +28,7 @@ class OptimizeOptions:
     """Run folder, whether its run came to the end or not; several, or session.db files, are joined, only read, and the
     map is that of the first"""
     settings: Annotated[BatchConfig, tyro.conf.arg(name="")] = field(default_factory=BatchConfig)
+    solving: Annotated[SolvingOptions, tyro.conf.arg(name="")] = field(default_factory=SolvingOptions)
     out: Path | None = None
     """Of several: folder for trajectory_NAME.tum of each, joined.g2o, loops.csv, summary.json and report.html"""
     out_name: str = "batch"
@@ -49,6 +51,8 @@ def main(arguments: list[str]) -> int:
     if options.out is None:
         if len(options.runs) != 1:
             raise UsageError("give one RUN, or several and the folder that they are joined in: --out FOLDER")
+        if options.solving != SolvingOptions():
+            raise UsageError("--engine, --workers and --scheduler are for several runs, which --out FOLDER joins")
         with log_in_run(options.runs[0], command):
             return _optimize_run(options, options.runs[0])
     if (options.settings, options.out_name) != (BatchConfig(), "batch"):
@@ -97,8 +101,8 @@ def _join_sessions(options: OptimizeOptions, out: Path) -> int:
     from vislam.runs.report.graph_page import write_graph_report
 
     check_writable(out)  # before the work, which may take minutes
-    with progress_bar("loops between sessions", "keyframes") as bar:
-        joined = join_sessions(options.runs, progress=bar)
+    with options.solving.team() as team, progress_bar("loops between sessions", "keyframes") as bar:
+        joined = join_sessions(options.runs, bar, team)
     write_joined(joined, out)
     if options.report:
         write_graph_report(joined.problem, joined.solution, " + ".join(joined.names), out / "report.html")

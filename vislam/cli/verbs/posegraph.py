@@ -11,6 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from vislam.cli.verbs.arguments import parse
+from vislam.cli.verbs.solving import SolvingOptions
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import PoseGraphConfig
 from vislam.core.collector import while_importing
@@ -25,6 +26,7 @@ class PoseGraphOptions:
     file: Positional[Path]
     """Pose graph; what is no format's ending .g2o, .toro or .isam is told by its contents"""
     settings: Annotated[PoseGraphConfig, tyro.conf.arg(name="")] = field(default_factory=PoseGraphConfig)
+    solving: Annotated[SolvingOptions, tyro.conf.arg(name="")] = field(default_factory=SolvingOptions)
     out: Path | None = None
     """Folder for optimized.g2o, trajectory.tum, trajectory_kitti.txt, poses.csv, edges.csv, summary.json and
     report.html; None: NAME_optimized in the working folder"""
@@ -54,9 +56,9 @@ def _optimize(options: PoseGraphOptions, out: Path) -> int:
 
     check_writable(out)  # before the work, which may take minutes
     limit = options.settings.iterations
-    with progress_bar(options.file.stem, "iterations") as bar:
+    with options.solving.team() as team, progress_bar(options.file.stem, "iterations") as bar:
         result = optimize_graph_file(
-            options.file, out, options.settings, lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}")
+            options.file, out, options.settings, lambda done, chi2: bar(done, limit, f"chi2 {chi2:.6g}"), team
         )
     if options.report:
         write_graph_report(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vislam.batch.posegraph.domains import Team
 from vislam.batch.posegraph.g2o import write_g2o
 from vislam.batch.posegraph.gnc import reject_suspects
 from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
@@ -65,16 +66,17 @@ class JoinedSessions:
     summary: dict[str, Any]
 
 
-def join_sessions(paths: Sequence[Path], progress: Progress | None = None) -> JoinedSessions:
+def join_sessions(paths: Sequence[Path], progress: Progress | None = None, team: Team | None = None) -> JoinedSessions:
     """Find loops between sessions (run folders or session files, only read) and optimise all of them as one graph.
 
-    Loops between sessions are the only edges that may be found false. Deterministic. Raises UsageError for sessions
-    that do not fit together, DataError for one that cannot be used, TrackingLostError where no loops join them.
+    Loops between sessions are the only edges that may be found false. `team`: see `optimize_pose_graph`. Deterministic.
+    Raises UsageError for sessions that do not fit together, DataError for one that cannot be used, TrackingLostError
+    where no loops join them.
     """
     parts = _read(paths)
     search = _Search(parts)
     models, inliers = search.run(progress)
-    return _optimised(parts, search, models, inliers, PoseGraphConfig())
+    return _optimised(parts, search, models, inliers, team)
 
 
 def write_joined(joined: JoinedSessions, out: Path) -> None:
@@ -225,7 +227,7 @@ class _Search:
 
 
 def _optimised(
-    parts: list[SessionPart], search: _Search, models: list[LoopModel], inliers: dict[int, int], config: PoseGraphConfig
+    parts: list[SessionPart], search: _Search, models: list[LoopModel], inliers: dict[int, int], team: Team | None
 ) -> JoinedSessions:
     """Judge the loops between sessions and optimise everything in the frame of the first."""
     suspects = [m for m in models if search.submaps.are_joined(m.record.from_id, m.record.to_id)]
@@ -236,10 +238,10 @@ def _optimised(
         edges.T_from_to[at] = invert(search.poses[k - 1]) @ search.poses[k]
     problem = problem_of(search.poses, edges)
     is_suspect = np.arange(len(edges.ends)) >= len(search.edges.ends)
-    weights = reject_suspects(problem, is_suspect, config)
+    weights = reject_suspects(problem, is_suspect, PoseGraphConfig())
     kept = weights[is_suspect] > 0.0
     _check_joined(parts, search, [m for m, k in zip(suspects, kept, strict=True) if k], len(models))
-    solution = optimize_pose_graph(problem.with_edges(weights != 0.0), replace(config, robust="none"))
+    solution = optimize_pose_graph(problem.with_edges(weights != 0.0), team=team)
     own = np.concatenate([part.poses for part in parts])
     solution = replace(solution, start=own, start_name="each session in its own map", weights=weights)
     chi2 = dict(zip([m.id for m in suspects], problem.edge_chi2(solution.poses)[is_suspect].tolist(), strict=True))

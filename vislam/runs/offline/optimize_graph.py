@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vislam.batch.posegraph.certificate import Certificate, certify
+from vislam.batch.posegraph.domains import Team
 from vislam.batch.posegraph.files import read_pose_graph
 from vislam.batch.posegraph.g2o import write_g2o
 from vislam.batch.posegraph.noise import NoiseOfKind, noise_of_kinds, rescaled
@@ -18,6 +19,7 @@ from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import Progress
 from vislam.batch.posegraph.uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
+from vislam.core.collector import paused
 from vislam.core.errors import StorageError, UsageError
 from vislam.core.files import write_json, write_text
 from vislam.core.geometry import quaternion_xyzw_from_rotation
@@ -41,15 +43,16 @@ class OptimizedGraph:
 
 
 def optimize_graph_file(
-    path: Path, out: Path, config: PoseGraphConfig, progress: Progress | None = None
+    path: Path, out: Path, config: PoseGraphConfig, progress: Progress | None = None, team: Team | None = None
 ) -> OptimizedGraph:
     """Optimise a g2o, TORO or iSAM file and write optimized.g2o, the trajectory in other formats and summary.json.
 
-    Everything is computed before anything is written. Raises DataError, UsageError, StorageError.
+    Everything is computed before anything is written. `team`: see `optimize_pose_graph`. Raises DataError, UsageError,
+    StorageError.
     """
     begun = time.perf_counter()
     problem = read_pose_graph(path, config.repair_information, config.isam_noise)
-    solution = optimize_pose_graph(problem, config, progress)
+    solution = optimize_pose_graph(problem, config, progress, team)
     problem, solution, noise = _noise(problem, solution, config, progress)
     certificate = None
     if config.certify:
@@ -169,6 +172,7 @@ def _in_space(problem: PoseGraphProblem, poses: Array) -> Array:
     return out
 
 
+@paused()
 def _write_trajectories(problem: PoseGraphProblem, poses: Array, out: Path) -> None:
     """Write poses.csv, trajectory.tum (a pose's id is its time in seconds) and trajectory_kitti.txt."""
     T, ids = _in_space(problem, poses)[problem.is_pose], problem.ids[problem.is_pose]
@@ -208,6 +212,7 @@ def _write_landmarks(problem: PoseGraphProblem, poses: Array, covariances: Array
     write_text(path, "\n".join([",".join(header), *lines]) + "\n")
 
 
+@paused()
 def _write_edges(problem: PoseGraphProblem, solution: PoseGraphSolution, path: Path) -> None:
     """Write which edges were kept, with their chi2 before and after."""
     names = np.array([str(i) for i in problem.ids.tolist()], dtype=object)

@@ -1,0 +1,80 @@
+"""The door to a Dask cluster: one that is there, or processes of this machine for as long as they are needed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from vislam.core.errors import UsageError, install_line
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_ANSWER_S = 20.0  # a scheduler that is there answers much sooner
+# tasks are given whole domains: Dask's warning of their size is of no use here
+_SETTINGS = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
+
+
+@contextmanager
+def dask_client(scheduler: str | None, workers: int) -> Iterator[Client]:
+    """Connect to the scheduler at an address, or start `workers` of one thread each, which hear loopback alone.
+
+    Raises UsageError without Dask, or without a scheduler at that address.
+    """
+    try:
+        import dask
+        import distributed
+    except ImportError as error:
+        raise UsageError(f"--engine dask needs the extra 'cluster': {install_line('cluster')}") from error
+    with dask.config.set(_SETTINGS):
+        if scheduler is None:
+            with (
+                distributed.LocalCluster(
+                    n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                ) as cluster,
+                distributed.Client(cluster) as client,
+            ):  # fmt: skip
+                yield client
+            return
+        try:
+            client = distributed.Client(scheduler, timeout=_ANSWER_S)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise UsageError(
+                f"no Dask scheduler answers at '{scheduler}': {error}; start one: dask scheduler"
+            ) from error
+        with client:
+            yield client
+
+
+class DaskTeam:
+    """Workers of a Dask cluster, who keep what they made.
+
+    What is lost with a worker is made again by another: the scheduler has what it was made of.
+    """
+
+    def __init__(self, client: Client) -> None:
+        """Take the connection; it stays the caller's to close."""
+        self._client = client
+
+    def keep(self, make: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Return what stands for make(*arguments), once for each, which stays with the worker that made it."""
+        return [self._client.submit(make, *a, pure=False) for a in arguments]
+
+    def each(self, task: Callable[..., Any], kept: Sequence[Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Return task(kept, *arguments) for each that is kept, in their order.
+
+        Raises UsageError where several workers ended at one of them, or no scheduler is there any more.
+        """
+        from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
+
+        futures = [self._client.submit(task, k, *a, pure=False) for k, a in zip(kept, arguments, strict=True)]
+        try:
+            return list(self._client.gather(futures))
+        except (CancelledError, KilledWorker, CommClosedError) as error:
+            raise UsageError(
+                f"the Dask cluster lost its workers or its scheduler ({type(error).__name__}); give workers more memory"
+            ) from error
