@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from session_entries import editing
-from vislam.batch.posegraph.files import read_pose_graph
+from vislam.batch import DaskTeam, dask_client, read_pose_graph
 from vislam.batch.posegraph.gnc import reject_suspects
 from vislam.cli import run_verb
 from vislam.config import PoseGraphConfig, load
@@ -99,11 +99,13 @@ def test_two_sessions_come_into_one_frame(runs, tmp_path, capsys):
         assert (again / name).read_bytes() == (out / name).read_bytes(), name
 
 
-def test_three_sessions_of_which_two_have_one_name(runs, tmp_path):
+def test_three_sessions_of_which_two_have_one_name_are_joined_by_domains(runs, tmp_path):
     copy = tmp_path / "tuesday"
     shutil.copytree(runs / "tuesday", copy)
-    joined = join_sessions([runs / "monday", runs / "tuesday" / "session.db", copy])
+    with dask_client(None, workers=1) as client:
+        joined = join_sessions([runs / "monday", runs / "tuesday" / "session.db", copy], team=DaskTeam(client))
     assert joined.names == ("monday", "tuesday", "tuesday-2")
+    assert joined.solution.converged
     ends = {(loop.from_session, loop.to_session) for loop in joined.loops if loop.kept}
     assert any(b == "tuesday-2" for _, b in ends)
     one, other = joined.trajectories[1:]
@@ -150,7 +152,8 @@ def test_usage(runs, tmp_path, capsys):
     assert run_verb(["optimize", monday, "--out", out]) == 2
     assert run_verb(["optimize", monday, monday, "--out", out]) == 2
     assert run_verb(["optimize", monday, str(runs / "tuesday")]) == 2
-    assert "--out FOLDER" in capsys.readouterr().err
+    assert run_verb(["optimize", monday, "--engine", "dask"]) == 2
+    assert capsys.readouterr().err.count("--out FOLDER") == 2
     assert run_verb(["optimize", monday, str(runs / "tuesday"), "--out", out, "--rounds", "1"]) == 2
     assert run_verb(["optimize", monday, str(tmp_path / "nowhere"), "--out", out]) == 3
     assert "no session at" in capsys.readouterr().err

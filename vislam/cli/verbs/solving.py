@@ -27,7 +27,10 @@ class SolvingOptions:
 
     @contextmanager
     def team(self) -> Iterator[DaskTeam | None]:
-        """Give who solves domains; None: the graph is solved as a whole. Raises UsageError for options that contradict each other."""
+        """Give who solves domains; None: the graph is solved as a whole.
+
+        Raises UsageError for options that contradict each other.
+        """
         if self.engine == "local":
             if self != SolvingOptions():
                 raise UsageError("--workers and --scheduler are of --engine dask")
