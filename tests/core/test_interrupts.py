@@ -146,6 +146,22 @@ def test_a_live_run_ends_at_random_moments_and_can_be_started_again(tmp_path: Pa
         once(reached, SIGNALS[k % 3], f"moment {k}, {share:.2f} of {spent_s:.2f} s of CPU")
 
 
+def test_workers_of_a_cluster_end_with_their_parent(tmp_path: Path) -> None:
+    graph = tmp_path / f"vislam-test-int-{os.getpid()}.g2o"
+    assert started(["simulate", "--graph", "torus", "--poses", "30000", "--out", str(graph)]).wait(HUNG_S) == 0
+    arguments = ["posegraph", str(graph), "--engine", "dask", "--out", str(tmp_path / "out")]
+    workers: list[psutil.Process] = []
+
+    def works(process: psutil.Process) -> bool:
+        workers[:] = [p for p in process.children(recursive=True) if "spawn_main" in " ".join(_words(p))]
+        return len(workers) == 2 and all(cpu_s(worker) > 3.0 for worker in workers)
+
+    check(interrupted(arguments, works, signal.SIGINT), signal.SIGINT, "while workers solve")
+    _, left = psutil.wait_procs(workers, timeout=HUNG_S)
+    assert left == []
+    assert not (tmp_path / "out" / "optimized.g2o").exists()
+
+
 STUCK = """
 import os, signal, sys, threading, time
 from vislam.core import interrupts

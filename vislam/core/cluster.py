@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vislam.core.errors import UsageError, install_line
+from vislam.core.interrupts import ignore
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -30,10 +32,12 @@ def dask_client(scheduler: str | None, workers: int) -> Iterator[Client]:
         raise UsageError(f"--engine dask needs the extra 'cluster': {install_line('cluster')}") from error
     with dask.config.set(_SETTINGS):
         if scheduler is None:
+            # of processes that Python looks after, whose end an interrupted parent does not wait for
+            os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
             with (
                 distributed.LocalCluster(
                     n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
+                    silence_logs=logging.CRITICAL, preload=[__name__],
                 ) as cluster,
                 distributed.Client(cluster) as client,
             ):  # fmt: skip
@@ -47,6 +51,11 @@ def dask_client(scheduler: str | None, workers: int) -> Iterator[Client]:
             ) from error
         with client:
             yield client
+
+
+def dask_setup(_: object) -> None:
+    """Leave interrupts to the parent, with which a worker ends; Dask calls this in each that `dask_client` starts."""
+    ignore()
 
 
 class DaskTeam:

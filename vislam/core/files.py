@@ -56,3 +56,10 @@ def plain(data: Any) -> Any:
     if isinstance(data, (float, np.floating)):
         return float(data) if np.isfinite(data) else None
     return data.item() if isinstance(data, np.generic) else data
+
+
+def check_writable(out: Path) -> None:
+    """Raise StorageError where a folder that is there, or is to be made, takes no files."""
+    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise StorageError(f"{out} cannot be written: no right to write in {there}; choose another --out")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import platform
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -157,13 +156,6 @@ def storage(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise StorageError(f"{path} cannot be written: {error}; free disk space or choose another --out") from error
-
-
-def check_writable(out: Path) -> None:
-    """Raise StorageError where a folder that is there, or is to be made, takes no files."""
-    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise StorageError(f"{out} cannot be written: no right to write in {there}; choose another --out")
 
 
 def read_metrics(run: Path) -> dict[str, Any]:

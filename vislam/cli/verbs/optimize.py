@@ -96,7 +96,7 @@ def _optimize_run(options: OptimizeOptions, run: Path) -> int:
 
 
 def _join_sessions(options: OptimizeOptions, out: Path) -> int:
-    from vislam.runs.folder import check_writable
+    from vislam.core.files import check_writable
     from vislam.runs.offline.join_sessions import join_sessions, write_joined
     from vislam.runs.report.graph_page import write_graph_report
 

@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> int:
 def _optimize(options: PoseGraphOptions, out: Path) -> int:
     with while_importing():  # it takes longer than solving most files
         from vislam.batch.posegraph.optimize import as_stated
-        from vislam.runs.folder import check_writable
+        from vislam.core.files import check_writable
         from vislam.runs.offline.optimize_graph import optimize_graph_file
         from vislam.runs.report.graph_page import write_graph_report
 
