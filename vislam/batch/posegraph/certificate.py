@@ -30,6 +30,7 @@ from vislam.core.messages import Array
 _GAP = 1e-6  # of the cost: a solution so near to the proven bound is the minimum
 _SAME = 1e-6  # of chi2: two solutions that differ by less cost the same
 _NOTHING = 1e-9  # chi2 counts squares of standard deviations; measurements without errors leave rounding alone
+_ROUNDING = 1e-9  # relative, of weights
 _STEPS, _CONVERGED = 200, 1e-9  # of the descent that compares: well beyond the line before
 
 
@@ -74,7 +75,8 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
         return _unproven(chi2, "there are landmarks or priors; the proof is for poses and relative poses alone")
     if (fixed := _tied(problem)) > 0:
         return _unproven(chi2, f"{fixed} poses are fixed, two or more in one part; the proof is for free poses")
-    graph = IsotropicGraph(problem, *isotropic_weights(problem))
+    of_cost = isotropic_weights(problem)
+    graph = IsotropicGraph(problem, *of_cost)
     if graph.factor_bytes > FACTOR_MAX_BYTES:
         return _unproven(chi2, f"its factor takes {graph.factor_bytes / 1e9:.1f} GB, more than is allowed")
     at = graph.minimise(poses)
@@ -100,13 +102,18 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
     else:
         reason = "the global minimum of the isotropic cost leads to this solution or to one of the same chi2"
     proven = cost - problem.dimension * len(poses) * spectrum.proven
+    isotropic_bound = max(proven, 0.0 if climbed is None else climbed.bound, 0.0)
+    of_bound = bounding_weights(problem)
+    # as of isotropic information in space: what is proven of this cost is of chi2, too
+    is_below = all(np.all(a <= (1.0 + _ROUNDING) * b) for a, b in zip(of_cost, of_bound, strict=True))
+    bound = isotropic_bound / (1.0 + _ROUNDING) if is_below else _bound(problem, poses, *of_bound)
     return Certificate(
         certified=least and better is None,
         reason=reason,
         chi2=chi2,
-        chi2_bound=min(_bound(problem, poses), chi2),
+        chi2_bound=min(bound, chi2),
         isotropic_cost=cost,
-        isotropic_bound=max(proven, 0.0 if climbed is None else climbed.bound, 0.0),
+        isotropic_bound=isotropic_bound,
         least_eigenvalue=spectrum.least,
         proven_eigenvalue=-spectrum.proven,
         tolerance=tolerance,
@@ -164,8 +171,8 @@ def bounding_weights(problem: PoseGraphProblem) -> tuple[Array, Array]:
     return 0.5 * share * turn, share * move
 
 
-def _bound(problem: PoseGraphProblem, poses: Array) -> float:
-    graph = IsotropicGraph(problem, *bounding_weights(problem))
+def _bound(problem: PoseGraphProblem, poses: Array, kappa: Array, tau: Array) -> float:
+    graph = IsotropicGraph(problem, kappa, tau)
     at = graph.minimise(poses)
     proven = graph.spectrum(at).proven
     return max(graph.value(at) - problem.dimension * len(poses) * proven, 0.0)
