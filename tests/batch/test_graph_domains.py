@@ -105,6 +105,15 @@ def test_the_verb_solves_by_processes_of_its_own(small_domains, tmp_path, capsys
     assert "domains start" in capsys.readouterr().out
 
 
+def test_a_cluster_without_workers_is_not_waited_for(tmp_path, monkeypatch):
+    made = simulate_graph("manhattan", replace(WORLD, poses=20))
+    with dask_cluster(tmp_path, names=()) as (address, _), dask_client(address, 0) as client:
+        monkeypatch.setattr("vislam.core.cluster._ANSWER_S", 1.0)
+        team = DaskTeam(client)
+        with pytest.raises(VislamError, match="no workers"):
+            optimize_pose_graph(made.problem, team=team)
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [(PoseGraphConfig(method="dogleg"), "--method lm"), (PoseGraphConfig(start="tree"), "--start auto or file")],

@@ -14,7 +14,8 @@ from vislam.core.interrupts import ignore
 if TYPE_CHECKING:
     from distributed import Client
 
-_ANSWER_S = 20.0  # a scheduler that is there answers much sooner
+_ANSWER_S = 20.0  # a scheduler that is there answers much sooner, and workers come
+_EMPTY = 4  # looks within that time, none of which finds a worker
 # tasks are given whole domains: Dask's warning of their size is of no use here
 _SETTINGS = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
 
@@ -75,15 +76,29 @@ class DaskTeam:
     def each(self, task: Callable[..., Any], kept: Sequence[Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Return task(kept, *arguments) for each that is kept, in their order.
 
-        Raises UsageError where several workers ended at one of them, or no scheduler is there any more.
+        Raises UsageError where several workers ended at one of them, or no worker or scheduler is there for long.
         """
         from distributed import CancelledError, KilledWorker
         from distributed.comm import CommClosedError
 
         futures = [self._client.submit(task, k, *a, pure=False) for k, a in zip(kept, arguments, strict=True)]
         try:
+            self._wait(futures)
             return list(self._client.gather(futures))
         except (CancelledError, KilledWorker, CommClosedError) as error:
             raise UsageError(
                 f"the Dask cluster lost its workers or its scheduler ({type(error).__name__}); give workers more memory"
             ) from error
+
+    def _wait(self, futures: list[Any]) -> None:
+        """Wait until all are done; tasks wait for ever where no worker comes."""
+        from distributed import wait
+
+        empty = 0
+        while empty < _EMPTY:
+            try:
+                wait(futures, timeout=_ANSWER_S / _EMPTY)
+                return
+            except TimeoutError:
+                empty = 0 if self._client.scheduler_info()["workers"] else empty + 1
+        raise UsageError("the Dask scheduler has no workers, or lost them; do they have this version of vislam?")
