@@ -12,7 +12,7 @@ import pytest
 from tiny import write_plan
 
 from dask_cluster import PATIENCE_S, dask_cluster, until
-from vislam import VislamError
+from vislam.core.errors import UsageError
 from vislam.experiment.engines import run_locally, run_on_dask
 from vislam.experiment.isolated import run_isolated
 from vislam.experiment.jobs import expand
@@ -119,8 +119,8 @@ def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, tmp_pa
 
 def test_a_cluster_that_is_not_there_is_one_line(specs, tmp_path, monkeypatch):
     monkeypatch.setattr("vislam.core.cluster._ANSWER_S", 0.5)
-    with pytest.raises(VislamError, match="no Dask scheduler answers at 'tcp://127"):
+    with pytest.raises(UsageError, match="no Dask scheduler answers at 'tcp://127"):
         list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(VislamError, match=r"pip install '\.\[cluster\]'"):
+    with pytest.raises(UsageError, match=r"pip install '\.\[cluster\]'"):
         list(run_on_dask(specs, "tcp://127.0.0.1:9", tmp_path, None))

@@ -84,25 +84,25 @@ def solve_by_domains(
 
     `start` [N, d + 1, d + 1]: where to begin; None: with each domain alone. It ends as `levenberg_marquardt` does.
     """
-    edges = problem.edges
-    neighbours = adjacency(len(problem.ids), *np.ascontiguousarray(edges.T))
+    neighbours = adjacency(len(problem.ids), *np.ascontiguousarray(problem.edges.T))
     cluster = grown(*neighbours, _CLUSTER)
-    between = np.ascontiguousarray(cluster[edges].T)
+    between = np.ascontiguousarray(cluster[problem.edges].T)
     domain = grown(*adjacency(int(cluster.max(initial=-1)) + 1, *between), _DOMAIN // _CLUSTER)[cluster]
-    at, parts = _overlapping(problem, domain, neighbours)
-    kept = team.keep(_domain, parts)
+    wholes, parts = _overlapping(problem, domain, neighbours)
+    kept, at = team.keep(_domain, parts), [(w, w[own]) for w, (_, own) in zip(wholes, parts, strict=True)]
+    del parts  # the team has them
     if start is None:
         start = np.empty_like(problem.poses)
-        for poses, (_, own), alone in zip(at, parts, team.each(_solved_alone, kept, [()] * len(kept)), strict=True):
-            start[poses[own]] = alone
+        for (_, own), alone in zip(at, team.each(_solved_alone, kept, [()] * len(kept)), strict=True):
+            start[own] = alone
         start = _moved_as_bodies(problem, start, domain, None)
         start = _moved_as_bodies(problem, start, cluster, _START.iterations)
 
     def stepped(poses: Array) -> Array:
         out = poses.copy()
-        of_domains = team.each(_stepped, kept, [(poses[a],) for a in at])
-        for a, (_, own), moved in zip(at, parts, of_domains, strict=True):
-            out[a[own]] = moved
+        of_domains = team.each(_stepped, kept, [(poses[whole],) for whole, _ in at])
+        for (_, own), moved in zip(at, of_domains, strict=True):
+            out[own] = moved
         return out
 
     return start, _descend(problem, start, stepped, iterations, tolerance, progress)
