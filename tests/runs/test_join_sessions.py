@@ -13,7 +13,7 @@ import pytest
 
 from session_entries import editing
 from vislam.batch import DaskTeam, dask_client, read_pose_graph
-from vislam.batch.posegraph.gnc import reject_suspects
+from vislam.batch.posegraph.auto import decide
 from vislam.cli import run_verb
 from vislam.config import PoseGraphConfig, load
 from vislam.core.geometry import invert, se3_exp, transform
@@ -175,5 +175,5 @@ def test_false_loops_between_are_rejected_and_odometry_is_not():
     information = np.tile(np.diag(sigma**-2), (len(ends) + len(false), 1, 1))
     problem = problem_of(poses, Edges(np.array(ends + false), np.array(measured), information))
     suspects = np.arange(len(ends) + len(false)) >= 2 * (count - 1)
-    weights = reject_suspects(problem, suspects, PoseGraphConfig())
+    weights = decide(problem, PoseGraphConfig(), doubtful=suspects).weights
     assert np.flatnonzero(weights == 0.0).tolist() == list(range(len(ends), len(ends) + len(false)))

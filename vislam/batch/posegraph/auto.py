@@ -19,7 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from vislam.batch.posegraph.gnc import doubtful_edges, joining_edges, reject_false_edges
+from vislam.batch.posegraph.gnc import reject_false_edges, trusted_edges
 from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
 from vislam.batch.posegraph.plain import solve
 from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
@@ -55,30 +55,34 @@ _THIN = 4.0  # log-odds of a cluster that stands alone, below which it is not be
 _NAMED = 5  # clusters in a message
 
 
-def decide(problem: PoseGraphProblem, config: PoseGraphConfig, progress: Progress | None = None) -> Decision:
-    """Return what evidence decides about the loops. Raises UsageError where the factor does not fit into memory.
+def decide(
+    problem: PoseGraphProblem, config: PoseGraphConfig, progress: Progress | None = None, doubtful: Mask | None = None
+) -> Decision:
+    """Return what evidence decides about the loops, or about edges `doubtful` [E].
 
     Variances that are stated far too large hide all evidence. So where loops that graduated non-convexity believes fit
-    much better than stated, all is judged with their scale.
+    much better than stated, all is judged with their scale. Raises UsageError where the factor does not fit into
+    memory.
     """
     structure = Structure(problem, config.equations)
-    weights, poses = reject_false_edges(structure, config.inlier_probability, progress)
+    trusted = trusted_edges(problem, doubtful)
+    weights, poses = reject_false_edges(structure, trusted, config.inlier_probability, progress)
     numbers = (int(weights.sum()) - len(structure.free)) * problem.tangent
     scale = problem.chi2(poses, weights) / max(numbers, 1)
     reason = ""
     if numbers >= _NUMBERS_MIN and 0.0 < scale < _OVERSTATED:
         problem = replace(problem, information=problem.information / scale)
         reason = f"; these on top of all variances times {scale:.3g}, which loops show"
-    decision = _decide(structure, problem, Decision(poses, weights, "graduated non-convexity"), config, progress)
+    gnc = Decision(poses, weights, "graduated non-convexity")
+    decision = _decide(structure, problem, trusted, gnc, config, progress)
     return replace(decision, reason=decision.reason + reason)
 
 
 def _decide(
-    structure: Structure, problem: PoseGraphProblem, gnc: Decision, config: PoseGraphConfig, progress: Progress | None
-) -> Decision:
+    structure: Structure, problem: PoseGraphProblem, trusted: Mask, gnc: Decision, config: PoseGraphConfig,
+    progress: Progress | None,
+) -> Decision:  # fmt: skip
     """Return what evidence decides about the loops of `problem`, the structure's with noise that fits."""
-    trusted = ~doubtful_edges(problem)
-    trusted |= joining_edges(problem, trusted)
     chain = problem.with_edges(trusted)
     odometry = odometry_start(chain, chain.anchors())
     if trusted.all():
@@ -155,8 +159,7 @@ def _largest(problem: PoseGraphProblem, edges: Mask) -> int:
 
 def decide_by_kernel(problem: PoseGraphProblem, kernel: Kernel, progress: Progress | None = None) -> Decision:
     """Return the loops that one kernel leaves at least a quarter of their weight, from odometry."""
-    trusted = ~doubtful_edges(problem)
-    trusted |= joining_edges(problem, trusted)
+    trusted = trusted_edges(problem)
     if trusted.all():
         return Decision(None, np.ones(len(trusted)), "there are no loops to doubt")
     chain = problem.with_edges(trusted)

@@ -17,7 +17,6 @@ from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import Progress, levenberg_marquardt
 from vislam.batch.posegraph.starts import odometry_start
 from vislam.batch.posegraph.structure import NormalEquations, Structure, adjoints
-from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert_many
 from vislam.core.messages import Array
@@ -39,23 +38,23 @@ TAILS = 4.0  # times the limit at the end: errors of real loops have heavier tai
 _SETTLED = 1e-3  # weights this close to 0 or 1 are decided
 
 
-def doubtful_edges(problem: PoseGraphProblem) -> Mask:
-    """Return which edges [E] may be false: those that do not join successive ids."""
-    return np.abs(problem.edges[:, 1] - problem.edges[:, 0]) != 1
+def trusted_edges(problem: PoseGraphProblem, doubtful: Mask | None = None) -> Mask:
+    """Return which edges [E] are not doubted; by default only those that do not join successive ids are.
+
+    Where these leave the graph in parts, as few of the others as join it are believed, too.
+    """
+    trusted = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1 if doubtful is None else ~doubtful
+    return trusted | joining_edges(problem, trusted)
 
 
 def reject_false_edges(
-    structure: Structure, probability: float, progress: Progress | None = None
+    structure: Structure, trusted: Mask, probability: float, progress: Progress | None = None
 ) -> tuple[Array, Array]:
     """Return the weights [E] of edges, 1 kept, 0 rejected, and poses near their optimum.
 
-    Edges between successive ids are never doubted.
-
-    Where these leave the graph in parts, as few others as join it are believed too.
+    Edges `trusted` [E] are never doubted and join all poses.
     """
     problem = structure.problem
-    trusted = ~doubtful_edges(problem)
-    trusted |= joining_edges(problem, trusted)
     limit = chi_square_limit(probability, problem.tangent)
     poses, candidates, scale = _gated(problem, trusted, limit, progress)
     weights = candidates.astype(np.float64)
@@ -63,15 +62,6 @@ def reject_false_edges(
         Structure(problem.with_edges(candidates)), poses, trusted[candidates], TAILS * limit * scale, progress
     )
     return weights, poses
-
-
-def reject_suspects(problem: PoseGraphProblem, suspects: Mask, config: PoseGraphConfig) -> Array:
-    """Return the weights [E] of edges, 1 kept, 0 rejected, of which only `suspects` [E] are doubted.
-
-    For a problem whose poses are good already, as those of sessions that several loops agreed to bring together.
-    """
-    limit = TAILS * chi_square_limit(config.inlier_probability, problem.tangent)
-    return graduated_non_convexity(Structure(problem), problem.poses, ~suspects, limit)[0]
 
 
 def joining_edges(problem: PoseGraphProblem, trusted: Mask) -> Mask:

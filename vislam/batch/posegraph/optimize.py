@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.batch.posegraph.auto import decide, decide_by_kernel
 from vislam.batch.posegraph.domains import Team, solve_by_domains
-from vislam.batch.posegraph.gnc import reject_false_edges
+from vislam.batch.posegraph.gnc import reject_false_edges, trusted_edges
 from vislam.batch.posegraph.plain import Plain, descend, solve
 from vislam.batch.posegraph.problem import Decision, Ids, PoseGraphProblem
 from vislam.batch.posegraph.sightings import reject_false_sightings, undetermined_landmarks, undetermined_message
@@ -153,7 +153,8 @@ def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress 
         return decide(structure.problem, config, progress)
     if config.robust in ("cauchy", "geman-mcclure", "dcs"):
         return decide_by_kernel(structure.problem, config.robust, progress)
-    weights, _ = reject_false_edges(structure, config.inlier_probability, progress)
+    trusted = trusted_edges(structure.problem)
+    weights, _ = reject_false_edges(structure, trusted, config.inlier_probability, progress)
     return Decision(None, weights, "graduated non-convexity, as asked for")
 
 

@@ -1,4 +1,7 @@
-"""Which loops to believe: the one place that decides, for live runs and finished ones."""
+"""Which loops a run believes while it goes on, keyframe by keyframe, in steps of milliseconds.
+
+A finished run, sessions that are joined and pose-graph files are decided whole, by `batch.posegraph.auto`.
+"""
 
 from vislam.graph.belief.loop_set import LoopSet
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from vislam.batch.posegraph.auto import decide
 from vislam.batch.posegraph.domains import Team
 from vislam.batch.posegraph.g2o import write_g2o
-from vislam.batch.posegraph.gnc import reject_suspects
 from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.uncertainty import Uncertainty
@@ -238,12 +238,13 @@ def _optimised(
         edges.T_from_to[at] = invert(search.poses[k - 1]) @ search.poses[k]
     problem = problem_of(search.poses, edges)
     is_suspect = np.arange(len(edges.ends)) >= len(search.edges.ends)
-    weights = reject_suspects(problem, is_suspect, PoseGraphConfig())
-    kept = weights[is_suspect] > 0.0
+    decision = decide(problem, PoseGraphConfig(), doubtful=is_suspect)
+    weights, kept = decision.weights, decision.weights[is_suspect] > 0.0
     _check_joined(parts, search, [m for m, k in zip(suspects, kept, strict=True) if k], len(models))
     solution = optimize_pose_graph(problem.with_edges(weights != 0.0), team=team)
     own = np.concatenate([part.poses for part in parts])
-    solution = replace(solution, start=own, start_name="each session in its own map", weights=weights)
+    notes = (*solution.notes, decision.warning) if decision.warning else solution.notes
+    solution = replace(solution, start=own, start_name="each session in its own map", weights=weights, notes=notes)
     chi2 = dict(zip([m.id for m in suspects], problem.edge_chi2(solution.poses)[is_suspect].tolist(), strict=True))
     fates = dict(zip([m.id for m in suspects], kept.tolist(), strict=True))
     loops = tuple(
