@@ -126,7 +126,7 @@ def test_json_that_is_nested_too_deep_is_refused(tmp_path, capsys):
     (run / "metrics.json").write_text('{"accuracy": ' + deep)
     with pytest.raises(DataError, match="too deep"):
         read_metrics(run)
-    assert run_verb(["report", str(run)]) == 0
+    assert run_verb(["report", str(run), "--figures", str(run / "figures")]) == 0
     (run / "config.json").write_text(deep)
     (run / "manifest.json").write_text(json.dumps({}))
     capsys.readouterr()

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from vislam.runs.report.drawing import Axis, Lines, drawing
+from vislam.runs.report.drawing import Axis, Lines, as_file, drawing, stacked
 
 SQUARE = np.array([[[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]]])
 
@@ -58,3 +58,30 @@ def test_nothing_or_a_dot_gives_a_picture(points: np.ndarray) -> None:
     text = drawing([Lines(points, "graph", 1.0)], Axis("x"), Axis("y"), height_pt=230)
     assert len(ticks(text)) >= 4
     assert "nan" not in text
+
+
+def test_a_line_is_broken_where_it_is_not_finite_and_ends_at_the_frame() -> None:
+    line = np.array([[[0.0, 0.0], [1.0, 9.0], [2.0, np.nan], [3.0, 1.0], [4.0, 2.0]]])
+    text = drawing([Lines(line, "graph", 1.0)], Axis("x"), Axis("y", ends=(0.0, 2.0)), height_pt=230)
+    first, second = drawn(text, "graph")
+    assert [len(first), len(second)] == [2, 2]
+    assert first[1, 1] == second[1, 1] == 70.0  # 9 is drawn where 2 is: at the upper edge
+
+
+def test_labels_stand_above_in_rows_and_names_in_place_of_ticks() -> None:
+    labels = [f"an estimate of {k}" for k in range(6)]
+    lines = [Lines(SQUARE, "graph", 1.0, label=label) for label in labels]
+    text = drawing(lines, Axis("", ends=(0.0, 4.0)), Axis("", names=("track", "loop")), height_pt=230)
+    words = [t for t in ElementTree.fromstring(text).iter() if t.tag.endswith("text")]
+    assert [t.text for t in words] == ["track", "loop", *labels]
+    rows = sorted({float(t.get("y")) for t in words[2:]})
+    assert len(rows) == 2 and min(at[:, 1].min() for at in drawn(text, "graph")[:1]) > rows[-1]
+    assert all(float(t.get("x")) + 47 * len(t.text) < 3960 for t in words[2:])
+
+
+def test_drawings_are_stacked_and_as_files_have_colours_of_their_own() -> None:
+    one = drawing([Lines(SQUARE, "graph", 1.0)], Axis("x"), Axis("y"), height_pt=100)
+    both = ElementTree.fromstring(stacked([one, one]))
+    assert both.get("viewBox") == "0 0 3960 2000"
+    assert [g.get("transform") for g in both if g.get("transform")] == ["translate(0 0)", "translate(0 1000)"]
+    assert "var(" not in as_file(one) and len(re.findall('stroke="#[0-9a-f]{6}"', as_file(one))) == 3

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from vislam.core.errors import DataError, StorageError
 from vislam.core.memory import GraphRecord, KeyframeEntry, PackedScan
 from vislam.core.messages import GraphUpdate
 from vislam.mapping.formats.ply import write_ply
-from vislam.runs.report import write_report
+from vislam.runs.report import write_figures, write_report
 from vislam.runs.report.run_files import read_run
 from vislam.runs.report.scene import build_scene, loop_segments
 from vislam.runs.session import SessionWriter
@@ -60,19 +61,6 @@ class Page(HTMLParser):
         return " ".join(self.texts)
 
 
-@pytest.fixture
-def drawn():
-    """Plots are drawn as for people; which takes a second of CPU for each report."""
-
-
-@pytest.fixture(autouse=True)
-def undrawn(request, monkeypatch):
-    """Plots are made, and drawn only for a test that asks for it."""
-    if "drawn" not in request.fixturenames:
-        for module in ("plots", "loop_plots"):
-            monkeypatch.setattr(f"vislam.runs.report.{module}.svg", lambda figure, name: f'<svg id="{name}"></svg>')
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "cart")
@@ -89,7 +77,7 @@ def copy(run, tmp_path):
     return target
 
 
-def test_a_whole_run_becomes_one_self_contained_page(run, drawn):
+def test_a_whole_run_becomes_one_self_contained_page(run):
     path = write_report(run)
     assert path == run / "report.html"
     text = path.read_text()
@@ -113,7 +101,7 @@ def test_a_whole_run_becomes_one_self_contained_page(run, drawn):
     assert re.findall(r"sha256-([^&]+)&#x27;", policy) == hashes
     assert policy.startswith("default-src &#x27;none&#x27;; img-src data:;")
     assert not re.search(r"url\((?!#)|@import", re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL))
-    assert page.tags.count("svg") == 5
+    assert page.tags.count("svg") == 6
     assert not re.search(r"#0[0-9a-f]0[0-9a-f]0[0-9a-f]\b", text)  # every stand-in colour was replaced
     assert text.count("var(--ekf)") > 5
     metrics = json.loads((run / "metrics.json").read_text())
@@ -134,6 +122,16 @@ def test_a_whole_run_becomes_one_self_contained_page(run, drawn):
     assert '"code_revision": "0123456789abcdef"' in page.text
 
 
+def test_drawings_become_files_for_a_paper(run, tmp_path):
+    paths = write_figures(run, tmp_path / "figures")
+    assert [path.name for path in paths] == [
+        "from_above.svg", "from_the_side.svg", "over_time.svg", "timing.svg", "gyroscope_bias.svg",
+        "accelerometer_bias.svg",
+    ]  # fmt: skip
+    for text in (path.read_text() for path in paths):
+        assert ElementTree.fromstring(text).tag.endswith("svg") and "var(" not in text
+
+
 def add_map_and_session(run):
     """Give a run folder a cloud and a session of two keyframes that keep their colours."""
     world = World(5.0, seed=3)
@@ -149,7 +147,7 @@ def add_map_and_session(run):
     writer.close(finished=True)
 
 
-def test_a_copied_folder_with_map_and_session_gives_the_same_bytes(copy, tmp_path, drawn):
+def test_a_copied_folder_with_map_and_session_gives_the_same_bytes(copy, tmp_path):
     add_map_and_session(copy)
     shutil.copytree(copy, tmp_path / "elsewhere" / copy.name)
     first = write_report(copy).read_bytes()
@@ -214,7 +212,7 @@ def test_a_run_without_truth_has_no_errors_but_all_paths(tmp_path):
     assert not any("ATE" in text for text in page.texts)
 
 
-def test_a_run_that_never_started_says_why(tmp_path, drawn):
+def test_a_run_that_never_started_says_why(tmp_path):
     (tmp_path / "metrics.json").write_text(
         json.dumps(
             {
@@ -266,7 +264,7 @@ def _half(data):
         ],
     ],
 )
-def test_damaged_files_are_named_and_the_rest_is_still_there(copy, damages, drawn):
+def test_damaged_files_are_named_and_the_rest_is_still_there(copy, damages):
     for name, damage, _ in damages:
         path = copy / name
         path.write_bytes(damage(path.read_bytes()))
@@ -287,7 +285,7 @@ def test_a_damaged_map_and_session_are_named_and_the_rest_is_still_there(copy, d
     assert "Trajectories" in page.headings
 
 
-def test_metrics_of_the_wrong_types_do_not_break_the_page(copy, drawn):
+def test_metrics_of_the_wrong_types_do_not_break_the_page(copy):
     nonsense = {"name": None, "frames": "many", "accuracy": {"graph": 3, "ekf": {"ate_rmse_m": None}}, "loops": []}
     nonsense |= {"timing_ms": {"ekf": {"p50": "fast"}, "x": 1}, "warnings": "none", "counters": {"a": {"b": "c"}}}
     nonsense |= {
@@ -298,7 +296,7 @@ def test_metrics_of_the_wrong_types_do_not_break_the_page(copy, drawn):
     assert "Trajectories" in Page(write_report(copy).read_text()).headings
 
 
-def test_a_trajectory_from_another_clock_is_not_drawn_over_the_truth(copy, drawn):
+def test_a_trajectory_from_another_clock_is_not_drawn_over_the_truth(copy):
     lines = (copy / "trajectory_ekf.tum").read_text().splitlines()
     (copy / "trajectory_ekf.tum").write_text(
         "\n".join(line.replace("17000000", "16000000", 1) for line in lines) + "\n"

@@ -17,6 +17,9 @@ class ReportOptions:
     run: Positional[Path]
     """Run folder"""
 
+    figures: Path | None = None
+    """Folder for the report's drawings as SVG files, for a paper"""
+
 
 OPTIONS = (ReportOptions,)
 
@@ -24,7 +27,9 @@ OPTIONS = (ReportOptions,)
 def main(arguments: list[str]) -> int:
     """Write the report of a run again."""
     options = parse(ReportOptions, arguments, "report")
-    from vislam.runs.report import write_report
+    from vislam.runs.report import write_figures, write_report
 
     print(write_report(options.run))
+    for path in [] if options.figures is None else write_figures(options.run, options.figures):
+        print(path)
     return 0

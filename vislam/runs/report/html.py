@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,11 @@ class Cell:
 def stylesheet() -> str:
     """Return the style sheet of every page, to be embedded."""
     return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
+
+
+def day_colors() -> dict[str, str]:
+    """Return the page's colours by day, #rrggbb, by their names in the style sheet."""
+    return dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", stylesheet().partition("}")[0]))
 
 
 def escape(value: object) -> str:

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 
 from vislam.loop import LoopRow, caption
-from vislam.runs.report import loop_plots
 from vislam.runs.report.html import Cell, card, escape, folded, grid, note, number, picture, section, table
 from vislam.runs.report.run_files import RunFiles, as_dict
 from vislam.runs.report.scene import Scene
@@ -40,9 +39,13 @@ def loops_section(run: RunFiles, scene: Scene) -> str:
 
 def _loop_quality(run: RunFiles) -> str:
     """Return how good the loops are, where `vislam eval RUN --loops` has compared them with the truth."""
+    if not run.loops_eval:
+        return ""
+    from vislam.runs.report import loop_plots  # matplotlib, which costs a run more than all its other pictures
+
     answer, edges, rule = run.loops_eval, as_dict(run.loops_eval, "edges"), as_dict(run.loops_eval, "rule")
     try:
-        figure = loop_plots.loop_quality(answer) if answer else ""
+        figure = loop_plots.loop_quality(answer)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         return card(note(f"loops_eval.json cannot be drawn: {type(error).__name__} {error}"))
     if not figure:

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from vislam.core.files import write_text
+from vislam.runs.folder import storage
 from vislam.runs.levelled import up_sentence
 from vislam.runs.report import plots
+from vislam.runs.report.drawing import as_file
 from vislam.runs.report.html import (
     Cell,
     bullets,
@@ -80,6 +82,24 @@ def write_report(run: Path) -> Path:
     path = run / "report.html"
     write_text(path, page)
     return path
+
+
+def write_figures(run: Path, out: Path) -> list[Path]:
+    """Write the report's line drawings as SVG files into a folder; return their paths. Raises as `write_report`."""
+    files = read_run(run)
+    scene = build_scene(files)
+    biases = plots.biases(files.states, scene) or ("", "")
+    drawings = {
+        **dict(zip(("from_above", "from_the_side"), _views(files, scene), strict=True)),
+        "over_time": plots.over_time(files, scene), "timing": _stage_times(files),
+        "gyroscope_bias": biases[0], "accelerometer_bias": biases[1],
+    }  # fmt: skip
+    with storage(out):
+        out.mkdir(parents=True, exist_ok=True)
+    paths = {out / f"{name}.svg": drawing for name, drawing in drawings.items() if drawing}
+    for path, drawing in paths.items():
+        write_text(path, as_file(drawing))
+    return list(paths)
 
 
 def _name(run: RunFiles) -> str:
@@ -254,14 +274,19 @@ def _consistency(scene: Scene) -> str:
 
 
 def _trajectories(run: RunFiles, scene: Scene) -> str:
-    if not any(len(path) > 1 for path in scene.paths.values()):
+    above, aside = _views(run, scene)
+    if not above:
         return ""
-    views = grid(
-        card(plots.top_view(run, scene), title="From above"), card(plots.side_view(scene), title="From the side")
-    )
+    views = grid(card(above, title="From above"), card(aside, title="From the side"))
     tilted = not scene.has_gravity and scene.truth is None and not as_dict(run.metrics, "up").get("direction")
     text = "There is no IMU to show what is up: z is that of the first camera." if tilted else ""
     return section("Trajectories", views, note(text) if text else "", kind="still of-map")
+
+
+def _views(run: RunFiles, scene: Scene) -> tuple[str, str]:
+    if not any(len(path) > 1 for path in scene.paths.values()):
+        return "", ""
+    return plots.top_view(run, scene), plots.side_view(scene)
 
 
 def _over_time(run: RunFiles, scene: Scene) -> str:
@@ -293,17 +318,24 @@ def _picture(path: Path) -> str:
     return picture(path, caption, kind="plan" if _is_plan(path) else "")
 
 
-def _timing(run: RunFiles) -> str:
-    stages = {
+def _stages(run: RunFiles) -> dict[str, dict[str, float]]:
+    return {
         name: {key: float(value) for key, value in stage.items() if isinstance(value, int | float)}
         for name, stage in as_dict(run.metrics, "timing_ms").items()
         if isinstance(stage, dict)
     }
-    if not stages:
-        return ""
+
+
+def _stage_times(run: RunFiles) -> str:
     frames, duration = run.metrics.get("frames"), run.metrics.get("duration_s")
     both = isinstance(frames, int) and isinstance(duration, int | float) and frames > 1
-    figure = plots.timing(stages, 1e3 * duration / (frames - 1) if both else None)  # type: ignore[operator]
+    return plots.timing(_stages(run), 1e3 * duration / (frames - 1) if both else None)  # type: ignore[operator]
+
+
+def _timing(run: RunFiles) -> str:
+    stages, figure = _stages(run), _stage_times(run)
+    if not stages:
+        return ""
     total = sum(stage.get("total_s", 0.0) for stage in stages.values())
     rows: list[list[str | Cell]] = []
     for name, stage in sorted(stages.items(), key=lambda item: -item[1].get("total_s", 0.0)):
@@ -340,11 +372,11 @@ def _cost(run: RunFiles) -> str:
 
 
 def _biases(run: RunFiles, scene: Scene) -> str:
-    figure = plots.biases(run.states, scene)
-    if not figure:
+    figures = plots.biases(run.states, scene)
+    if figures is None:
         return ""
     text = "Solid: graph with ±3σ. Dashed: EKF."
-    return section("Inertial biases", card(f'<div class="scroll wide">{figure}</div>'), note(text))
+    return section("Inertial biases", grid(*map(card, figures)), note(text))
 
 
 def _lost(run: RunFiles) -> str:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from vislam.core.messages import Array, NavState
+from vislam.runs.report.drawing import Axis, Kind, Lines, drawing, stacked
 from vislam.runs.report.run_files import RunFiles
 from vislam.runs.report.scene import Scene, loop_segments
-from vislam.runs.report.style import CODE, RC, svg
 
-_WIDTHS = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
+_WIDTHS_PT = {"ekf": 1.3, "live": 1.0, "graph": 1.7, "batch": 1.3}
 _STATE_COLORS = {"ok": "good", "degraded": "warn", "lost": "bad", "blind": "muted"}
+_WIDE_PT = 806.0
+_VIEW_PT = 338.0  # high
 _MAX_STRETCH = 25.0  # of the vertical axis: more would turn millimetres into mountains
 _MAX_REJECTED = 200  # loops drawn: more is a red cloud
 _MAX_LOOP_LINES = 25
@@ -26,248 +23,195 @@ _MAX_POINTS = 1500  # per line: more cannot be seen and only makes the file heav
 
 def top_view(run: RunFiles, scene: Scene) -> str:
     """Draw all trajectories from above, with loops; equal scales."""
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(5.5, 4.7), layout="constrained")
-        axes = figure.add_subplot()
-        _draw_paths(axes, scene, 0, 1)
-        _draw_loops(axes, run, scene)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set(xlabel="x [m]", ylabel="y [m]")
-        _legend_above(axes, columns=3)
-        return svg(figure, "top")
+    lines = [*_loops(run, scene), *_paths(scene, [0, 1])]
+    return drawing(lines, Axis("x [m]"), Axis("y [m]"), height_pt=_VIEW_PT, same_scale=True)
 
 
 def side_view(scene: Scene) -> str:
     """Draw all trajectories from the side; the vertical scale is stretched where the motion is flat."""
-    positions = np.concatenate([t.positions_m for t in _all_paths(scene).values()])
-    extent = np.ptp(positions, axis=0)
-    along = 0 if extent[0] >= extent[1] else 1
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(5.5, 4.7), layout="constrained")
-        axes = figure.add_subplot()
-        _draw_paths(axes, scene, along, 2)
-        axes.set(xlabel=f"{'xy'[along]} [m]", ylabel="z [m]")
-        if extent[2] > 0.35 * extent[along]:
-            axes.set_aspect("equal", adjustable="datalim")
-        else:
-            middle = float(np.mean(axes.get_ylim()))
-            half = max(0.65 * float(np.ptp(axes.get_ylim())), 0.5 * extent[along] / _MAX_STRETCH)
-            axes.set_ylim(middle - half, middle + half)
-            figure.draw_without_rendering()
-            box = axes.get_window_extent()
-            stretch = (box.height / np.ptp(axes.get_ylim())) / (box.width / np.ptp(axes.get_xlim()))
-            axes.set_ylabel(f"z [m], stretched {stretch:.0f}×" if stretch >= 1.5 else "z [m]")
-        _legend_above(axes, columns=4)
-        return svg(figure, "side")
+    positions = np.concatenate([path.positions_m for path in [*scene.paths.values(), scene.truth] if path])
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    along = 0 if high[0] - low[0] >= high[1] - low[1] else 1
+    length, rise = high[along] - low[along], high[2] - low[2]
+    x, lines = Axis(f"{'xy'[along]} [m]"), _paths(scene, [along, 2])
+    if rise > 0.35 * length:
+        return drawing(lines, x, Axis("z [m]"), height_pt=_VIEW_PT, same_scale=True)
+    shown = max(1.3 * rise, length / _MAX_STRETCH, 1e-6)
+    stretch = 0.8 * length / shown  # the frame is as much wider than high
+    label = f"z [m], stretched {stretch:.0f}×" if stretch >= 1.5 else "z [m]"
+    ends = (float(low[2] + high[2] - shown) / 2, float(low[2] + high[2] + shown) / 2)
+    return drawing(lines, x, Axis(label, ends=ends), height_pt=_VIEW_PT)
 
 
 def over_time(run: RunFiles, scene: Scene) -> str:
     """Draw errors, inliers and the tracking state over time, with a mark at every accepted loop."""
-    panels = [name for name, wanted in (("position", scene.errors), ("rotation", scene.errors)) if wanted]
+    closed = scene.seconds([loop.to_t_ns for loop in run.loops if loop.decision == "accepted" and loop.to_t_ns >= 0])
+    panels: list[tuple[list[Lines], Axis, float]] = []
+    for attribute, label, height_pt in (
+        ("position_m", "position error [m]", 175.0),
+        ("rotation_deg", "rotation error [°]", 110.0),
+    ):
+        lines = [
+            _line(curve.t_s, getattr(curve, attribute), name, _WIDTHS_PT[name], "" if panels else scene.labels[name])
+            for name in ("ekf", "live", "graph", "batch")
+            if (curve := scene.errors.get(name)) is not None
+        ]
+        if lines:
+            panels.append((*_marked(lines, closed, label), height_pt))
     if run.tracking is not None and len(run.tracking.t_ns):
-        panels += ["inliers", "state"]
+        t, inliers = scene.seconds(run.tracking.t_ns), run.tracking.inliers.astype(np.float64)
+        lines = [_band(t, np.zeros(len(t)), inliers, "muted", 0.18), _line(t, inliers, "muted", 0.8)]
+        panels += [(*_marked(lines, closed, "inliers"), 90.0), (_states(run, t), Axis("", names=("state",)), 28.0)]
     if not panels:
         return ""
-    ratios = {"position": 3.0, "rotation": 1.8, "inliers": 1.3, "state": 0.35}
-    heights = [ratios[name] for name in panels]
-    closed = scene.seconds([loop.to_t_ns for loop in run.loops if loop.decision == "accepted" and loop.to_t_ns >= 0])
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(11.2, 0.75 * sum(heights) + 0.8), layout="constrained")
-        grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})
-        for name, axes in zip(panels, grid[:, 0], strict=True):
-            if name == "position":
-                _draw_errors(axes, scene, "position_m", "position error [m]")
-            elif name == "rotation":
-                _draw_errors(axes, scene, "rotation_deg", "rotation error [°]")
-            elif name == "inliers":
-                _draw_inliers(axes, run, scene)
-            else:
-                _draw_state(axes, run, scene)
-            if name != "state":
-                _mark_loops(axes, closed)
-        if scene.errors:
-            _legend_above(grid[0, 0], columns=4)
-        grid[-1, 0].set_xlabel("time [s]")
-        grid[-1, 0].set_xlim(0.0, max(scene.end_s, 1e-3))
-        figure.align_ylabels()
-        return svg(figure, "time")
+    ends, last = (0.0, max(scene.end_s, 1e-3)), len(panels) - 1
+    parts = []
+    for k, (lines, y, height_pt) in enumerate(panels):
+        x = Axis("time [s]" if k == last else "", ends=ends)
+        parts.append(drawing(lines, x, y, height_pt=height_pt + 29.0 * (k == last), width_pt=_WIDE_PT))
+    return stacked(parts)
 
 
 def timing(stages: Mapping[str, Mapping[str, float]], period_ms: float | None) -> str:
     """Draw p50, p95 and p99 of every stage on a logarithmic axis, with the time between two frames."""
-    rows = [
-        (name, stage) for name, stage in stages.items() if all(stage.get(p, 0.0) > 0.0 for p in ("p50", "p95", "p99"))
-    ]
+    keys = ("p50", "p95", "p99")
+    rows = [(name, stage) for name, stage in stages.items() if all(stage.get(key, 0.0) > 0.0 for key in keys)]
     if not rows:
         return ""
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(5.5, 0.3 * len(rows) + 0.95), layout="constrained")
-        axes = figure.add_subplot()
-        for k, (_, stage) in enumerate(rows):
-            axes.plot([stage["p50"], stage["p99"]], [k, k], color=CODE["graph"], linewidth=1.2, alpha=0.45)
-        for mark, key, size in (("o", "p50", 26), ("|", "p95", 46), (">", "p99", 16)):
-            values = [stage[key] for _, stage in rows]
-            axes.scatter(values, range(len(rows)), marker=mark, s=size, color=CODE["graph"], label=key, zorder=3)
-        if period_ms:
-            axes.axvline(period_ms, color=CODE["bad"], linewidth=0.9, linestyle=(0, (4, 3)), label="frame period")
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(numticks=12))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_yticks(range(len(rows)), [name for name, _ in rows])
-        axes.tick_params(axis="y", labelcolor=CODE["ink"], length=0)
-        axes.set_ylim(len(rows) - 0.4, -0.6)
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel("milliseconds per call")
-        _legend_above(axes, columns=4)
-        return svg(figure, "timing")
+    at = np.arange(len(rows), dtype=np.float64)
+    p50, p95, p99 = (np.array([stage[key] for _, stage in rows]) for key in keys)
+    ends = (len(rows) - 0.4, -0.6)
+    lines = [
+        Lines(_upright(p50, at, p99, at), "graph", 1.2, 0.45),
+        Lines(_upright(p50, at, p50, at), "graph", 5.0, label="p50"),
+        Lines(_upright(p95, at - 0.25, p95, at + 0.25), "graph", 1.2, label="p95"),
+        Lines(_upright(p99, at, p99, at), "graph", 3.0, label="p99"),
+    ]
+    if period_ms:
+        period = np.array([period_ms])
+        lines.append(Lines(_upright(period, *ends[:1], period, *ends[1:]), "bad", 0.9, 1.0, "frame period", "dashed"))
+    y = Axis("", ends=ends, names=tuple(name for name, _ in rows))
+    return drawing(lines, Axis("milliseconds per call", log=True), y, height_pt=21.6 * len(rows) + 68.0)
 
 
-def biases(states: Mapping[str, list[NavState]], scene: Scene) -> str:
-    """Draw gyroscope and accelerometer biases of the graph with three sigma, and those of the EKF dashed."""
+def biases(states: Mapping[str, list[NavState]], scene: Scene) -> tuple[str, str] | None:
+    """Draw gyroscope and accelerometer biases of the graph with three sigma, and those of the EKF dashed.
+
+    None without an IMU, which has them.
+    """
     states = {
         name: [s for s in of_one if np.isfinite(np.diag(s.covariance)[9:]).all()] for name, of_one in states.items()
     }
     if not any(states.values()):
-        return ""  # without an IMU there are none
-    with mpl.rc_context(RC):
-        figure = Figure(figsize=(11.2, 2.9), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        for axes, attribute, first, unit in (
-            (left, "gyro_bias_rad_s", 9, "gyroscope bias [mrad/s]"),
-            (right, "accel_bias_m_s2", 12, "accelerometer bias [m/s²]"),
-        ):
-            factor = 1e3 if "mrad" in unit else 1.0
-            for name, style in (("graph", "-"), ("ekf", "--")):
-                if states.get(name):
-                    _draw_bias(axes, states[name], scene, attribute, first, factor, style)
-            axes.axhline(0.0, color=CODE["line"], linewidth=0.8, zorder=0.6)
-            axes.set(ylabel=unit, xlabel="time [s]")
-            axes.set_xlim(0.0, max(scene.end_s, 1e-3))
-        _legend_above(left, columns=3)
-        return svg(figure, "biases")
+        return None
+    return (
+        _bias(states, scene, "gyro_bias_rad_s", 9, 1e3, "gyroscope bias [mrad/s]"),
+        _bias(states, scene, "accel_bias_m_s2", 12, 1.0, "accelerometer bias [m/s²]"),
+    )
 
 
-def _draw_bias(
-    axes: Any, states: list[NavState], scene: Scene, attribute: str, first: int, factor: float, style: str
-) -> None:
-    fill = style == "-"
-    t = scene.seconds(np.array([s.t_ns for s in states]))
-    values = factor * np.array([getattr(s, attribute) for s in states])
-    variances = np.array([np.diag(s.covariance)[first : first + 3] for s in states])
-    band = 3.0 * factor * np.sqrt(np.maximum(variances, 0.0))
-    for k, axis in enumerate("xyz"):
-        color = CODE[f"axis-{axis}"]
-        axes.plot(t, values[:, k], style, color=color, linewidth=1.4 if fill else 0.9, label=axis if fill else None)
-        if fill:
-            axes.fill_between(
-                t, values[:, k] - band[:, k], values[:, k] + band[:, k], color=color, alpha=0.12, linewidth=0
-            )
-    if fill:  # the first sigmas are those of the prior and would flatten everything else
-        late = slice(min(len(t) // 5, len(t) - 1), None)
-        low, high = (values - band)[late].min(), (values + band)[late].max()
-        low, high = min(low, values.min()), max(high, values.max())
-        margin = 0.08 * max(high - low, 1e-9)
-        axes.set_ylim(low - margin, high + margin)
+def _bias(
+    states: Mapping[str, list[NavState]], scene: Scene, attribute: str, first: int, factor: float, label: str
+) -> str:
+    lines: list[Lines] = []
+    ends = None
+    for name in ("graph", "ekf"):
+        of_one = states.get(name)
+        if not of_one:
+            continue
+        t = scene.seconds(np.array([s.t_ns for s in of_one]))
+        values = factor * np.array([getattr(s, attribute) for s in of_one])
+        variances = np.array([np.diag(s.covariance)[first : first + 3] for s in of_one])
+        band = 3.0 * factor * np.sqrt(np.maximum(variances, 0.0))
+        for k, axis in enumerate("xyz"):
+            color = f"axis-{axis}"
+            if name == "ekf":
+                lines.append(_line(t, values[:, k], color, 0.9, kind="dashed"))
+                continue
+            lines += [
+                _band(t, values[:, k] - band[:, k], values[:, k] + band[:, k], color, 0.12),
+                _line(t, values[:, k], color, 1.4, axis),
+            ]
+        if name == "graph":  # the first sigmas are those of the prior and would flatten everything else
+            late = slice(min(len(t) // 5, len(t) - 1), None)
+            low = min((values - band)[late].min(), values.min(), 0.0)
+            high = max((values + band)[late].max(), values.max(), 0.0)
+            margin = 0.08 * max(high - low, 1e-9)
+            ends = (float(low - margin), float(high + margin))
+    end_s = max(scene.end_s, 1e-3)
+    zero = Lines(np.array([[[0.0, 0.0], [end_s, 0.0]]]), "line", 0.8)
+    x, y = Axis("time [s]", ends=(0.0, end_s)), Axis(label, ends=ends)
+    return drawing([zero, *lines], x, y, height_pt=209.0)
 
 
-def _all_paths(scene: Scene) -> dict[str, Any]:
-    paths = {name: path for name, path in scene.paths.items() if len(path)}
-    return paths if scene.truth is None else {"truth": scene.truth, **paths}
-
-
-def _draw_paths(axes: Any, scene: Scene, horizontal: int, vertical: int) -> None:
-    for name, path in _all_paths(scene).items():
-        points = _thin(path.positions_m)
-        if name == "truth":
-            axes.plot(
-                points[:, horizontal],
-                points[:, vertical],
-                color=CODE["truth"],
-                linewidth=2.4,
-                alpha=0.55,
-                label=scene.labels["truth"],
-            )
-        elif name != "live" or "graph" not in scene.paths:
-            # the causal path jumps at loops by design; drawn beside the final one it only hides it
-            axes.plot(
-                points[:, horizontal],
-                points[:, vertical],
-                color=CODE[name],
-                linewidth=_WIDTHS[name],
-                label=scene.labels[name],
-            )
+def _paths(scene: Scene, axes: list[int]) -> list[Lines]:
+    """Return the trajectories along two axes of the map."""
+    lines = []
+    if scene.truth is not None and len(scene.truth):
+        lines.append(_path(scene.truth.positions_m[:, axes], "truth", 2.4, 0.55, scene.labels["truth"]))
+    for name, path in scene.paths.items():
+        # the causal path jumps at loops by design; drawn beside the final one it only hides it
+        if len(path) and (name != "live" or "graph" not in scene.paths):
+            lines.append(_path(path.positions_m[:, axes], name, _WIDTHS_PT[name], 1.0, scene.labels[name]))
     best = next((scene.paths[name] for name in ("graph", "live", "ekf") if len(scene.paths.get(name, ()))), None)
     if best is not None:
-        start = best.positions_m[0]
-        axes.plot(
-            start[horizontal], start[vertical], "o", markersize=5, markerfacecolor=CODE["paper"], color=CODE["ink"],
-            markeredgewidth=1.1, label="start", zorder=5,
-        )  # fmt: skip
+        start = np.repeat(best.positions_m[None, :1, axes], 2, axis=1)
+        lines += [Lines(start, "ink", 5.5, label="start"), Lines(start, "paper", 3.0)]
+    return lines
 
 
-def _draw_loops(axes: Any, run: RunFiles, scene: Scene) -> None:
-    """Draw rejected loops faintly under everything, accepted ones above, with a dot where the loop was closed."""
+def _loops(run: RunFiles, scene: Scene) -> list[Lines]:
+    """Return rejected loops, faint, and accepted ones, with a dot where the loop was closed."""
     rejected = loop_segments(run, scene, "rejected")[:_MAX_REJECTED, :, :2]
     accepted = loop_segments(run, scene, "accepted")[:, :, :2]
-    if len(rejected):
-        axes.add_collection(LineCollection(list(rejected), colors=CODE["bad"], linewidths=0.5, alpha=0.2, zorder=1))
-        axes.plot([], [], color=CODE["bad"], linewidth=0.7, label="loops rejected")
-    if len(accepted):
-        few = len(accepted) <= _MAX_LOOP_LINES
-        width, size, order = (1.1, 5, 4) if few else (0.5, 2, 1.5)
-        axes.add_collection(LineCollection(list(accepted), colors=CODE["good"], linewidths=width, zorder=order))
-        axes.plot(*accepted[:, 1].T, ".", color=CODE["good"], markersize=size, zorder=order)  # many lines are short
-        axes.plot([], [], ".-", color=CODE["good"], linewidth=1.1, markersize=5, label="loops accepted")
+    few = len(accepted) <= _MAX_LOOP_LINES
+    return [
+        Lines(rejected, "bad", 0.5, 0.2, "loops rejected"),
+        Lines(accepted, "good", 1.1 if few else 0.5, 1.0, "loops accepted"),
+        Lines(accepted[:, [1, 1]], "good", 3.5 if few else 1.4),  # many lines are short
+    ]
 
 
-def _draw_errors(axes: Any, scene: Scene, attribute: str, label: str) -> None:
-    for name in ("ekf", "live", "graph", "batch"):
-        curve = scene.errors.get(name)
-        if curve is not None:
-            t, values = _thin(curve.t_s), _thin(getattr(curve, attribute))
-            axes.plot(t, values, color=CODE[name], linewidth=_WIDTHS[name], label=scene.labels[name])
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel(label)
+def _marked(lines: list[Lines], closed_s: Array, label: str) -> tuple[list[Lines], Axis]:
+    """Return lines from zero on over times marked by strokes, and their axis.
 
-
-def _mark_loops(axes: Any, closed_s: Array) -> None:
-    """Mark times by lines; where there are many, by short strokes at the top that leave the curves readable."""
+    Where there are many strokes, they are short ones at the top that leave the curves readable.
+    """
+    top = 1.05 * max((float(np.nanmax(group.points[..., 1], initial=0.0)) for group in lines), default=0.0)
+    top = top if np.isfinite(top) and top > 0.0 else 1.0
     few = len(closed_s) <= _MAX_LOOP_LINES
-    axes.vlines(
-        closed_s, 0.0 if few else 0.95, 1.0, transform=axes.get_xaxis_transform(), color=CODE["good"],
-        linewidth=0.7, alpha=0.5 if few else 0.9, zorder=0.5,
-    )  # fmt: skip
+    strokes = Lines(_upright(closed_s, 0.0 if few else 0.95 * top, closed_s, top), "good", 0.7, 0.5 if few else 0.9)
+    return [strokes, *lines], Axis(label, ends=(0.0, top))
 
 
-def _draw_inliers(axes: Any, run: RunFiles, scene: Scene) -> None:
+def _states(run: RunFiles, t: Array) -> list[Lines]:
+    """Return a bar for each spell of one tracking state."""
     assert run.tracking is not None
-    t, inliers = scene.seconds(run.tracking.t_ns), run.tracking.inliers
-    axes.fill_between(_thin(t), _thin(inliers), color=CODE["muted"], alpha=0.18, linewidth=0)
-    axes.plot(_thin(t), _thin(inliers), color=CODE["muted"], linewidth=0.8)
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel("inliers")
-
-
-def _draw_state(axes: Any, run: RunFiles, scene: Scene) -> None:
-    assert run.tracking is not None
-    t = scene.seconds(run.tracking.t_ns)
     states = run.tracking.tracking
     period = float(np.median(np.diff(t))) if len(t) > 1 else 0.1
     starts = [0, *(k for k in range(1, len(states)) if states[k] != states[k - 1] or t[k] - t[k - 1] > 5 * period)]
-    for start, stop in zip(starts, [*starts[1:], len(states)], strict=True):
-        end = t[stop - 1] + period
-        axes.axvspan(t[start], end, color=CODE[_STATE_COLORS[states[start]]], alpha=0.8, linewidth=0)
-    axes.set_yticks([])
-    axes.set_ylabel("state", rotation=0, ha="right", va="center")
-    axes.grid(visible=False)
-    axes.spines[["left", "bottom"]].set_visible(False)
+    return [
+        _band(np.array([t[a], t[b - 1] + period]), np.full(2, -0.5), np.full(2, 0.5), _STATE_COLORS[states[a]], 0.8)
+        for a, b in zip(starts, [*starts[1:], len(states)], strict=True)
+    ]
 
 
-def _thin(values: Array) -> Array:
-    return values[:: len(values) // _MAX_POINTS + 1]
+def _upright(x0: Array, y0: Array | float, x1: Array, y1: Array | float) -> Array:
+    """Return lines [N, 2, 2] between points."""
+    ends = np.broadcast_arrays(x0, y0, x1, y1)
+    return np.stack(ends, axis=-1).reshape(-1, 2, 2)
 
 
-def _legend_above(axes: Any, columns: int) -> None:
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.4)
+def _line(t: Array, values: Array, color: str, width_pt: float, label: str = "", kind: Kind = "solid") -> Lines:
+    return _path(np.column_stack((t, values)), color, width_pt, 1.0, label, kind)
+
+
+def _path(points: Array, color: str, width_pt: float, opacity: float, label: str, kind: Kind = "solid") -> Lines:
+    return Lines(points[:: len(points) // _MAX_POINTS + 1][None], color, width_pt, opacity, label, kind)
+
+
+def _band(t: Array, low: Array, high: Array, color: str, opacity: float) -> Lines:
+    every = slice(None, None, len(t) // _MAX_POINTS + 1)
+    t, low, high = t[every], low[every], high[every]
+    around = np.column_stack((np.concatenate((t, t[::-1])), np.concatenate((low, high[::-1]))))
+    return Lines(around[None], color, 0.0, opacity, kind="filled")

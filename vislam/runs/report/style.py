@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from vislam.runs.report.html import stylesheet
+from vislam.runs.report.html import day_colors
 
 # matplotlib cannot write CSS variables: these colours stand for them and are replaced in the SVG
 _VARIABLES = {
@@ -59,8 +59,7 @@ RC: dict[str, Any] = {
 
 def light() -> tuple[dict[str, str], dict[str, Any]]:
     """Return the page's colours by name as they are by day, and the same settings as `RC` with them, for a PNG."""
-    root = stylesheet().partition("}")[0]
-    colors = {name: value for name, value in re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", root) if name in CODE}
+    colors = {name: value for name, value in day_colors().items() if name in CODE}
     by_code = {CODE[name]: value for name, value in colors.items()}
     return colors, {key: by_code.get(value, value) if isinstance(value, str) else value for key, value in RC.items()}
 
