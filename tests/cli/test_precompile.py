@@ -41,7 +41,7 @@ def test_a_job_compiles_once(kernels: Path, tmp_path_factory, monkeypatch: pytes
 
 
 def test_a_job_that_failed_leaves_no_stamp_and_no_error(kernels: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(precompile, "JOBS", {"unknown to the child": Job("nothing", 1, ())})
+    monkeypatch.setattr(precompile, "JOBS", {"unknown to the child": Job(1, ())})
     assert precompile.main([]) == 0
     assert "not all could be compiled ahead" in capsys.readouterr().err
     assert list(kernels.rglob("vislam-compiled-*")) == []
@@ -69,7 +69,7 @@ def test_a_stamp_holds_for_one_source_only(kernels: Path, monkeypatch: pytest.Mo
 def test_a_child_says_nothing_but_names_of_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = (
         "import sys; from vislam.cli import precompile as p\n"
-        "p.JOBS = {'version': p.Job('', 1, (('--version',), ('posegraph', 'absent.g2o')))}\n"
+        "p.JOBS = {'version': p.Job(1, (('--version',), ('posegraph', 'absent.g2o')))}\n"
         "sys.exit(p.main(['version']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
