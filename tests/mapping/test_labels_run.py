@@ -86,7 +86,7 @@ def test_a_run_with_label_images_has_a_labelled_map_and_all_else_is_as_without(r
 
 
 def test_a_session_keeps_labels_and_the_map_is_made_of_it_again(run, labels, tmp_path):
-    answer = rebuild(run, map_settings(run).map, tmp_path, "graph", None)
+    answer = rebuild(run, map_settings(run).map, tmp_path, "graph")
     assert answer["depth"] == "session"
     assert answer["labels"]["keyframes labelled"] == answer["keyframes"]
     names = ["labels.ply", "labels.json", "cloud.ply"]
@@ -146,7 +146,7 @@ def test_damaged_labels_of_a_session_are_refused(run, tmp_path):
     with editing(copy / "session.db") as db:
         db.execute("UPDATE labels SET png = ? WHERE id = 1", (bytes(cv2.imencode(".png", np.ones((3, 3)))[1]),))
     with pytest.raises(DataError, match="labels are no image of the size of its depth"):
-        rebuild(copy, map_settings(copy).map, tmp_path / "out", "graph", None)
+        rebuild(copy, map_settings(copy).map, tmp_path / "out", "graph")
 
 
 def test_a_network_in_the_pipeline_labels_keyframes(run, labels):

@@ -52,9 +52,9 @@ run(sys.argv[2], pathlib.Path(sys.argv[3]), stop)
 """
 
 
-def run(source, out, progress=None):
+def run(source, out, *progress):
     prepare(out, False)
-    return execute(open_source(str(source), 0), load(None, SETTINGS), out, str(source), ["test"], progress)
+    return execute(open_source(str(source), 0), load(None, SETTINGS), out, str(source), ["test"], *progress)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_replay_gives_identical_maps(recording, finished, tmp_path):
 
 def test_made_again_from_the_session_the_maps_are_the_same(finished, tmp_path):
     out, _ = finished
-    answer = rebuild(out, map_settings(out).map, tmp_path, "graph", None)
+    answer = rebuild(out, map_settings(out).map, tmp_path, "graph")
     assert answer["depth"] == "session"
     assert set(answer["written"]) >= set(PRODUCTS)
     assert all((tmp_path / name).read_bytes() == data for name, data in maps_of(out).items())
@@ -135,7 +135,7 @@ def test_a_killed_run_is_resumed_with_its_depth_and_ends_with_the_map_of_its_ses
     after = depth_images(killed)
     assert after[: len(before)] == before
     assert len(after) > len(before)
-    rebuild(killed, map_settings(killed).map, tmp_path, "graph", None)
+    rebuild(killed, map_settings(killed).map, tmp_path, "graph")
     assert all((tmp_path / name).read_bytes() == data for name, data in maps_of(killed).items())
 
 

@@ -54,7 +54,7 @@ def test_another_resolution_and_other_products(run, tmp_path):
     config = replace(
         map_settings(run).map, resolution_m=0.1, cloud_voxel_m=0.05, products=("pcd", "octomap", "surfels")
     )
-    answer = rebuild(run, config, tmp_path, "graph", None)
+    answer = rebuild(run, config, tmp_path, "graph")
     assert set(answer["written"]) == {"pcd", "octomap", "surfels"}
     assert read_octree(tmp_path / "octomap.bt").resolution_m == 0.1
     assert 0 < len(read_pcd(tmp_path / "cloud.pcd")[0]) < len(read_ply(run / "map" / "cloud.ply")[0])
@@ -62,13 +62,13 @@ def test_another_resolution_and_other_products(run, tmp_path):
 
 def test_other_filters_read_the_recording_again(run, tmp_path):
     config = map_settings(run).map
-    answer = rebuild(run, replace(config, edge_px=config.edge_px + 2), tmp_path, "graph", None)
+    answer = rebuild(run, replace(config, edge_px=config.edge_px + 2), tmp_path, "graph")
     assert answer["depth"] == "recording"
     assert len(read_ply(tmp_path / "cloud.ply")[0]) < len(read_ply(run / "map" / "cloud.ply")[0])
     # what the recording gives with the run's own settings is what the run kept
     other = shutil.copytree(run, tmp_path / "copy")
     _write_config(other, replace(map_settings(run), map=replace(config, enabled=False)))
-    again = rebuild(other, config, tmp_path / "again", "graph", None)
+    again = rebuild(other, config, tmp_path / "again", "graph")
     assert again["depth"] == "recording"
     assert (tmp_path / "again" / "octomap.bt").read_bytes() == (run / "map" / "octomap.bt").read_bytes()
 
@@ -87,12 +87,12 @@ def test_poses_of_another_estimate(run, tmp_path):
     text = "".join(f"{r[0]} {float(r[1]) + 10.0} {' '.join(r[2:])}\n" for r in rows)
     (moved / "trajectory_batch.tum").write_text(text)
     config = replace(map_settings(moved).map, products=("octomap",))
-    rebuild(moved, config, tmp_path / "out", "batch", None)
+    rebuild(moved, config, tmp_path / "out", "batch")
     here, there = (read_octree(path / "octomap.bt").occupied_voxels() for path in (run / "map", tmp_path / "out"))
     shift = (np.median(there, axis=0) - np.median(here, axis=0)) * 0.05
     np.testing.assert_allclose(shift, [10.0, 0.0, 0.0], atol=0.25)
     with pytest.raises(UsageError, match="there are: batch, ekf, graph"):
-        rebuild(moved, config, tmp_path / "out", "best", None)
+        rebuild(moved, config, tmp_path / "out", "best")
 
 
 def test_the_verb(run, tmp_path, capsys):
@@ -114,7 +114,7 @@ def test_what_cannot_be_made_again_is_said(run, tmp_path, capsys):
     broken = shutil.copytree(run, tmp_path / "broken")
     (broken / "session.db").write_bytes((run / "session.db").read_bytes()[:5000])
     with pytest.raises(DataError):
-        rebuild(broken, MapConfig(), tmp_path / "out", "graph", None)
+        rebuild(broken, MapConfig(), tmp_path / "out", "graph")
     assert run_verb(["map", str(broken)]) == 3
     text = capsys.readouterr().err
     assert text.startswith("vislam: ")

@@ -63,7 +63,7 @@ def film(world, poses, dark_from=None):
 def run(recording, out, base=None, **settings):
     prepare(out, overwrite=False)
     changed = {name.replace("__", "."): value for name, value in settings.items()}
-    return execute(recording, load(None, {**SETTINGS, **changed}), out, "film", [], None, base)
+    return execute(recording, load(None, {**SETTINGS, **changed}), out, "film", [], base=base)
 
 
 def by_depth(out):
@@ -123,7 +123,7 @@ def test_a_run_in_a_map_that_is_resumed_and_goes_dark_then_asks_depth_too(old, t
     with pytest.raises(KeyboardInterrupt):
         execute(recording, config, out, "film", [], stop, MapChoice(old, False))
     _, config, base = read_setup(out)
-    metrics = resume(recording, config, out, "film", [], None, base)
+    metrics = resume(recording, config, out, "film", [], base=base)
     assert metrics["resumed"]
     assert metrics["counters"]["depth in map"]["asked"] > 0  # since then
     again = metrics["resumed"][0]["keyframe"]

@@ -23,7 +23,7 @@ def run(out, base=None, localize_only=False, settings=None, **options):
     prepare(out, overwrite=False)
     recording = open_world("handheld-room", camera_hz=10.0, image_width_px=320, **options)
     choice = None if base is None else MapChoice(base / "session.db", localize_only)
-    return execute(recording, load(None, SETTINGS | (settings or {})), out, "test", [], None, choice)
+    return execute(recording, load(None, SETTINGS | (settings or {})), out, "test", [], base=choice)
 
 
 def occupied_m(path):
@@ -100,7 +100,7 @@ def test_a_submap_that_no_loop_joined_has_a_map_of_its_own_also_when_maps_are_ma
     metrics = run(out, settings={"loop.enabled": False}, duration_s=5.0, blank_begin_s=2.0, blank_length_s=1.0)
     assert metrics["counters"]["front"]["submaps"] == 2
     assert {path.name for path in (out / "map" / "submap_1").iterdir()} == PRODUCTS
-    answer = rebuild(out, map_settings(out).map, tmp_path / "again", "graph", None)
+    answer = rebuild(out, map_settings(out).map, tmp_path / "again", "graph")
     assert json.dumps(answer["left_out"]).count("submap_1") > 0
     for name in [*PRODUCTS, *(f"submap_1/{name}" for name in PRODUCTS)]:
         assert (out / "map" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name

@@ -73,7 +73,7 @@ def test_the_final_trajectory_and_the_map_stand_upright(auto):
 
 def test_the_map_made_again_is_that_of_the_run(auto, tmp_path):
     _, out = auto
-    answer = rebuild(out, map_settings(out).map, tmp_path, "graph", None)
+    answer = rebuild(out, map_settings(out).map, tmp_path, "graph")
     assert answer["up"]["source"] == "planes"
     for name in ("cloud.ply", "octomap.bt", "grid.pgm", "drive.pgm"):
         assert (tmp_path / name).read_bytes() == (out / "map" / name).read_bytes()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding, Severity, worst
+from vislam.core.progress import Progress, silent
 from vislam.core.recording import Problems
 from vislam.datasets import survey as survey_recording
 from vislam.datasets.camera_turns import fit_turns, follow_turns, turn_findings, turn_places
@@ -91,8 +92,8 @@ def _camera_of(rig: Rig | None, index: int) -> Camera | None:
     return rig.cameras[index] if rig is not None and index < len(rig.cameras) else None
 
 
-def inspect(uri: str) -> Inspection:
-    """Examine `FORMAT:PATH` or a bare path.
+def inspect(uri: str, progress: Progress = silent) -> Inspection:
+    """Examine `FORMAT:PATH` or a bare path; `progress` takes what is done, of how much, and of what.
 
     Raises UsageError or DataError only when there is no recording to look at: a wrong name, an empty folder.
     """
@@ -100,15 +101,15 @@ def inspect(uri: str) -> Inspection:
     problems = Problems()
     problems.update(found.problems)
     problems.judges |= found.problems.judges
-    inspector = _Inspector(found, problems)
+    inspector = _Inspector(found, problems, progress)
     return inspector.run(uri)
 
 
 class _Inspector:
     """Goes through one survey and collects findings; each check stands alone, so that one failure hides no other."""
 
-    def __init__(self, found: Survey, problems: Problems) -> None:
-        self._found = found
+    def __init__(self, found: Survey, problems: Problems, progress: Progress) -> None:
+        self._found, self._progress = found, progress
         self._problems = problems
         self._findings: list[Finding] = [Finding("error", str(error), str(found.root)) for error in found.errors]
         self._findings += [Finding("warning", str(error), str(found.root)) for error in found.lacking.values()]
@@ -119,7 +120,7 @@ class _Inspector:
     def run(self, uri: str) -> Inspection:
         found = self._found
         frames = frame_table(found, self._problems) if found.cameras else None
-        self._findings += (*found.findings, *rgbd_findings(found, frames))
+        self._findings += (*found.findings, *rgbd_findings(found, frames, self._progress))
         self._check_cameras(frames)
         facts = self._check_imu()
         if frames is not None and facts is not None:
@@ -196,6 +197,7 @@ class _Inspector:
         self._checks.compare(images, repeats(images))
         for i in range(len(images.files)):
             path = images.path(i)
+            self._progress(i + 1, len(images.files), images.name)
             try:
                 size = probe(path)
                 self._size_bytes += path.stat().st_size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -12,6 +12,7 @@ from typing import Any
 
 from vislam.core.errors import TrackingLostError, UsageError
 from vislam.core.files import write_json, write_text
+from vislam.core.progress import Progress, silent
 from vislam.core.revision import code_revision
 from vislam.experiment import engines, winners
 from vislam.experiment.identity import environment
@@ -27,8 +28,6 @@ from vislam.experiment.trials import Trial, table_sha256, trials
 from vislam.experiment.verify import read_manifest, verify
 from vislam.runs.folder import storage
 
-Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, a short note
-
 TESTED = ("ate_m", "rpe_5m_percent")
 
 
@@ -41,7 +40,7 @@ class Answer:
     exit_code: int = 0  # 4: `verify` found numbers that do not come out again
 
 
-def run_comparison(options: CompareOptions, command: list[str], progress: Progress | None = None) -> Answer:
+def run_comparison(options: CompareOptions, command: list[str], progress: Progress = silent) -> Answer:
     """Do what `vislam compare` was asked to.
 
     Raises:
@@ -66,9 +65,7 @@ def run_comparison(options: CompareOptions, command: list[str], progress: Progre
     )
 
 
-def run_missing(
-    jobs: Sequence[Job], store: ResultStore, options: CompareOptions, progress: Progress | None = None
-) -> int:
+def run_missing(jobs: Sequence[Job], store: ResultStore, options: CompareOptions, progress: Progress = silent) -> int:
     """Run the jobs that have no result yet and keep each as it comes; return how many ran.
 
     An interrupt loses only what was running. Raises UsageError when a worker had other code or packages.
@@ -76,8 +73,7 @@ def run_missing(
     wanted = {job.key: job for job in unique(list(jobs))}
     missing = [job for job in wanted.values() if store.status(job.key) is None]
     done, mismatch = len(wanted) - len(missing), ""
-    if progress is not None:
-        progress(done, len(wanted), "")
+    progress(done, len(wanted), "")
     added = 0
     with closing(_engine(missing, options)) as finished:
         for spec, result in finished:
@@ -86,8 +82,7 @@ def run_missing(
             elif result["status"] != "stopped":
                 added += store.add(spec["key"], wanted[spec["key"]].label, spec, result)
             done += 1
-            if progress is not None:
-                progress(done, len(wanted), result["status"])
+            progress(done, len(wanted), result["status"])
     if mismatch:
         raise UsageError(f"a worker has other code or packages than this process: {mismatch}; results so far are kept")
     return added
@@ -186,7 +181,7 @@ def _manifest(text: str, jobs: Sequence[Job], found: Sequence[Trial], command: l
     }
 
 
-def _verify(options: CompareOptions, plan: Plan, jobs: Sequence[Job], progress: Progress | None) -> Answer:
+def _verify(options: CompareOptions, plan: Plan, jobs: Sequence[Job], progress: Progress) -> Answer:
     assert options.verify is not None
     manifest = read_manifest(options.verify)
 
@@ -198,8 +193,7 @@ def _verify(options: CompareOptions, plan: Plan, jobs: Sequence[Job], progress: 
                 if result["status"] in ("mismatch", "stopped"):
                     raise UsageError(f"a job could not be run again: {result['reason']}")
                 results[spec["key"]] = result
-                if progress is not None:
-                    progress(len(results), len(wanted), result["status"])
+                progress(len(results), len(wanted), result["status"])
         return results
 
     text = plan_text(options.plan, options.estimator, options.peer)

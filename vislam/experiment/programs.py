@@ -25,13 +25,14 @@ from vislam.core.geometry import are_rotations
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.kinds import Kinds, lacking
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.progress import Progress, silent
 from vislam.core.recording import Recording
 from vislam.core.trajectory import Trajectory
 from vislam.experiment.stated import checked, write_stated
 from vislam.factors import nearest_rigid
 from vislam.frontend import mode_for
 from vislam.runs.cost import CostMeter
-from vislam.runs.drive import Progress, imu_noise
+from vislam.runs.drive import imu_noise
 from vislam.runs.sources import shaken
 from vislam.trajectory import write_tum
 
@@ -124,7 +125,7 @@ def identity(program: str) -> str:
 
 def run_program(
     program: str, options: Mapping[str, Any], recording: Recording, config: Config, out: Path,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Run an estimator over a recording, write its trajectories and the truth into `out`, and return its metrics.
 
@@ -185,14 +186,13 @@ class _Run:
             raise UsageError(f"estimator {program}: {cls.__name__}(setup, **options): {error}") from error
         self._estimator = self._asked(partial(make, self._setup, **options), "at the start")
 
-    def feed(self, progress: Progress | None) -> None:
+    def feed(self, progress: Progress) -> None:
         """Give everything to the estimator, and ask for its answer."""
         magnetic = getattr(self._estimator, "magnetic", None)
         for value in self._recording.events():
             if isinstance(value, Frame):
                 self._see(value)
-                if progress is not None:
-                    progress(len(self._t_ns), self._recording.frame_count, "")
+                progress(len(self._t_ns), self._recording.frame_count, "")
             elif isinstance(value, MagSample):
                 if magnetic is not None:
                     self._asked(partial(magnetic, value), f"magnetometer sample at {value.t_ns} ns")

@@ -12,12 +12,11 @@ from vislam.core.late import late
 
 if TYPE_CHECKING:
     from vislam.runs.begin import begun, check_fits, execute, map_of, resume
-    from vislam.runs.drive import Progress, Run, imu_noise
+    from vislam.runs.drive import Run, imu_noise
     from vislam.runs.further_sensors import further_readings
     from vislam.runs.offline.depth_localiser import depth_localiser
 
 __all__ = [
-    "Progress",
     "Run",
     "begun",
     "check_fits",
@@ -37,7 +36,6 @@ __getattr__ = late(
         "execute": "vislam.runs.begin",
         "map_of": "vislam.runs.begin",
         "resume": "vislam.runs.begin",
-        "Progress": "vislam.runs.drive",
         "depth_localiser": "vislam.runs.offline.depth_localiser",
         "further_readings": "vislam.runs.further_sensors",
         "Run": "vislam.runs.drive",

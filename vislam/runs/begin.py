@@ -16,12 +16,13 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
+from vislam.core.progress import Progress, silent
 from vislam.core.recording import Recording, with_camera
 from vislam.factors import rig_data
 from vislam.imu import ImuNoise
 from vislam.mapping.semantic.images import LabelFolder
 from vislam.pipeline.settings import derived
-from vislam.runs.drive import Progress, Run, imu_noise
+from vislam.runs.drive import Run, imu_noise
 from vislam.runs.folder import MapChoice, storage, write_setup
 from vislam.runs.levelled import stored_up
 from vislam.runs.session import Session, SessionWriter, has_begun, recall
@@ -40,7 +41,7 @@ def execute(
     out: Path,
     source: str,
     command: list[str],
-    progress: Progress | None = None,
+    progress: Progress = silent,
     base: MapChoice | None = None,
 ) -> dict[str, Any]:
     """Run a recording into the prepared folder `out` and return its metrics; see `Run.execute`.
@@ -56,7 +57,7 @@ def resume(
     out: Path,
     source: str,
     command: list[str],
-    progress: Progress | None = None,
+    progress: Progress = silent,
     base: MapChoice | None = None,
 ) -> dict[str, Any]:
     """Go on with the run in `out` after its last stored keyframe and return the metrics of the whole.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +20,7 @@ from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.memory import FrontMemory, GraphRecord, KeyframeEntry, SlamMemory
 from vislam.core.messages import Localisation, LoopDecision, Submaps, Tracking
+from vislam.core.progress import Progress, silent
 from vislam.core.recording import Recording
 from vislam.imu import ImuNoise
 from vislam.loop import LoopRow, caption
@@ -50,7 +50,6 @@ from vislam.trajectory import Trajectory
 if TYPE_CHECKING:
     from vislam.runs.viewer.recording import RunViewer
 
-Progress = Callable[[int, int, str], None]  # frames done, frames in all, a short note
 
 _LOG = logging.getLogger(__name__)
 
@@ -146,7 +145,7 @@ class Run:
         self.base = self.session.base()
         self.session.move(update, GraphRecord())
 
-    def execute(self, progress: Progress | None = None) -> dict[str, Any]:
+    def execute(self, progress: Progress = silent) -> dict[str, Any]:
         """Process the whole recording and write every file; return the metrics.
 
         Whatever happens, what was computed is written, after an interrupt without map and pictures; then the error is
@@ -187,7 +186,7 @@ class Run:
             poses = dict(zip(back.graph.ids.tolist(), back.graph.poses(), strict=True))
             self.viewer.go_on(int(self.log.stamps_ns[0]), poses)
 
-    def _feed(self, progress: Progress | None) -> None:
+    def _feed(self, progress: Progress) -> None:
         assert isinstance(self.slam, Slam)
         values = self._input.values(self._from)
         with interrupts.counted() as asked:
@@ -198,8 +197,7 @@ class Run:
                     return
                 for step in self.slam.feed(value):
                     self._take(step)
-                    if progress is not None:
-                        progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
+                    progress(len(self.log), self.recording.frame_count, str(step.front.track.vo.tracking))
         raise KeyboardInterrupt  # between two values, where the pipeline is whole
 
     def _take(self, step: Step) -> None:

@@ -10,22 +10,23 @@ from typing import Any
 from vislam.config import Config, load
 from vislam.core.errors import VislamError
 from vislam.core.log import log_to
+from vislam.core.progress import Progress, silent
 from vislam.core.recording import Recording
 from vislam.core.up import parse_up
 from vislam.datasets.calibrated import with_clock
 from vislam.pipeline.settings import derived
 from vislam.runs.begin import execute
-from vislam.runs.drive import Progress, imu_noise
+from vislam.runs.drive import imu_noise
 from vislam.runs.folder import map_choice, prepare
 from vislam.runs.loaded import LoadedRun, load_run
 from vislam.runs.sources import open_source
 
-Show = Callable[[str], AbstractContextManager[Progress | None]]  # of the recording's name
+Show = Callable[[str], AbstractContextManager[Progress]]  # of the recording's name
 
 
 def run(
     source: str, *, out: Path | str, config: Config | Path | str | None = None, overwrite: bool = False,
-    in_map: Path | str | None = None, localize_only: bool = False, progress: Progress | None = None, **settings: Any,
+    in_map: Path | str | None = None, localize_only: bool = False, progress: Progress = silent, **settings: Any,
 ) -> LoadedRun:  # fmt: skip
     """Run a recording or simulated world into a new folder, as `vislam run` does, and return what it left.
 

@@ -87,19 +87,14 @@ def frame_ends(depth_m: ImageF32, image: ImageU8, flow_px_s: ImageF32, delay_s: 
 def _ends(depth_m: ImageF32) -> tuple[Array, Array, Array]:
     """Return row and column of the last pixel of foregrounds along rows, and on which side (+1: right) they end."""
     height, width = depth_m.shape
-    valid = depth_m > 0.0
-    last = np.maximum.accumulate(np.where(valid, np.arange(width), -1), axis=1)
-    before = np.full_like(last, -1)
-    before[:, 1:] = last[:, :-1]
-    rows, columns = np.nonzero(valid & (before >= 0))
-    left = before[rows, columns]
-    near = columns - left <= _MOST_GAP_PX
-    rows, columns, left = rows[near], columns[near], left[near]
-    ratio = depth_m[rows, columns] / depth_m[rows, left]
-    ends, begins = ratio > 1.0 + _JUMP, ratio < 1.0 / (1.0 + _JUMP)
-    rows = np.concatenate([rows[ends], rows[begins]])
-    columns = np.concatenate([left[ends], columns[begins]])
-    sides = np.concatenate([np.ones(int(ends.sum()), dtype=np.int64), -np.ones(int(begins.sum()), dtype=np.int64)])
+    valid = np.flatnonzero(depth_m > 0.0)
+    depths = depth_m.ravel()[valid]
+    ratio = depths[1:] / depths[:-1]
+    near = np.diff(valid) <= _MOST_GAP_PX
+    ends, begins = (np.flatnonzero(near & far) for far in (ratio > 1.0 + _JUMP, ratio < 1.0 / (1.0 + _JUMP)))
+    ends, begins = (at[valid[at] // width == valid[at + 1] // width] for at in (ends, begins))
+    rows, columns = np.divmod(np.concatenate([valid[ends], valid[begins + 1]]), width)
+    sides = np.repeat(np.array([1, -1]), [len(ends), len(begins)])
     inside = (columns > _REACH_PX + 2) & (columns < width - _REACH_PX - 3) & (rows >= 2) & (rows < height - 2)
     rows, columns, sides = rows[inside], columns[inside], sides[inside]
     marks = np.zeros(depth_m.shape, dtype=np.int8)
@@ -117,14 +112,14 @@ def _score(profiles: Array, speed_px_s: Array, delay_s: float) -> Array:
     out = np.zeros((len(_LAGS_S), len(_OFFSETS_PX)))
     places = np.arange(-_REACH_PX, _REACH_PX + 1.0)
     steps = np.round(speed_px_s / _SPEED_STEP_PX_S).astype(np.int64)
+    lags_s = delay_s - np.array(_LAGS_S)[:, None]
     for step in np.unique(steps):
         speed = step * _SPEED_STEP_PX_S
         if abs(speed) > _FASTEST_PX_S:
             continue
         summed = profiles[steps == step].sum(axis=0)
         mean = float(summed.mean())
-        for i, lag_s in enumerate(_LAGS_S):
-            out[i] += np.interp(-(_OFFSETS_PX + speed * (delay_s - lag_s)), places, summed, left=mean, right=mean)
+        out += np.interp(-(_OFFSETS_PX + speed * lags_s), places, summed, left=mean, right=mean)
     return out
 
 

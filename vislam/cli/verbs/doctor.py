@@ -13,7 +13,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from vislam.cli.verbs.arguments import parse, take_path
-from vislam.cli.verbs.terminal import number, print_table
+from vislam.cli.verbs.terminal import number, print_table, progress_bar
 from vislam.config import SensorsConfig, load_sensors
 from vislam.config.ranges import Range
 from vislam.core.errors import DataError, HardwareError, UsageError, printable
@@ -61,7 +61,8 @@ def _examine_recording(options: DoctorOptions) -> int:
         raise UsageError(f"doctor examines {options.source} or the sensors of this machine, not both; leave one out")
     from vislam.datasets.inspect import inspect
 
-    inspection = inspect(options.source)
+    with progress_bar("examined", "images") as bar:
+        inspection = inspect(options.source, bar)
     if options.json:
         told = asdict(inspection)
         if not inspection.topics:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Rig
 from vislam.core.messages import Array, Bools, ImageF32
+from vislam.core.progress import Progress, silent
 from vislam.datasets.images import NO_DEPTH, UnreadableImageError, read_raw_depth
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.rgbd.pair_tracks import PairTracks, Walk, walk
@@ -64,13 +65,13 @@ class RgbdFacts:
         return edges if self.focal is None else edges + self.focal.lag_s
 
 
-def rgbd_facts(found: Survey, rig: Rig, frames: FrameTable) -> RgbdFacts:
+def rgbd_facts(found: Survey, rig: Rig, frames: FrameTable, progress: Progress = silent) -> RgbdFacts:
     """Measure a recording with depth; raises DataError when an image is not of the calibrated size."""
     odd, valid_share, median_m = _numbers(found, rig)
     given = found.depth_format
     unknown = tuple(one.value for one in odd if not one.is_known)
     found = replace(found, depth_format=replace(given, invalid=(*given.invalid, *unknown)))
-    seen = walk(found, rig, frames)
+    seen = walk(found, rig, frames, progress)
     edges = align_edges(seen.ends)
     focal = _focal(found, rig, frames, seen, edges)
     return RgbdFacts(odd, valid_share, median_m, edges, focal, seen.frames)

@@ -9,6 +9,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
+from vislam.core.progress import Progress, silent
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.rgbd.facts import RgbdFacts, rgbd_facts
 from vislam.datasets.stream import Survey
@@ -110,13 +111,13 @@ def offset_words(offset_px: np.typing.NDArray[np.float64]) -> str:
     return f"{abs(dx):.1f} px {'right' if dx > 0.0 else 'left'} and {abs(dy):.1f} px {'down' if dy > 0.0 else 'up'}"
 
 
-def rgbd_findings(found: Survey, frames: FrameTable | None) -> list[Finding]:
+def rgbd_findings(found: Survey, frames: FrameTable | None, progress: Progress = silent) -> list[Finding]:
     """Return what `vislam doctor` reports of colour against depth; nothing without depth or calibration."""
     rig = found.rig
     if rig is None or found.depth is None or frames is None or not np.any(frames.depth_rows >= 0):
         return []
     try:
-        facts = rgbd_facts(found, rig, frames)
+        facts = rgbd_facts(found, rig, frames, progress)
     except DataError as error:
         return [Finding("error", str(error), "depth0", "see docs/formats.md")]
     faults = rgbd_faults(facts, rig.cameras[0].width)

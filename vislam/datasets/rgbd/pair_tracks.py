@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Rig
 from vislam.core.messages import Array, ImageF32, ImageU8
+from vislam.core.progress import Progress, silent
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.stream import Survey, open_loader
 from vislam.vision.depth_edges import FrameEnds, frame_ends
@@ -125,7 +126,7 @@ def _at_end(step: Array, beside: Array | None = None) -> Array:
     return step if beside is None else 1.5 * step - 0.5 * beside
 
 
-def walk(found: Survey, rig: Rig, frames: FrameTable) -> Walk:
+def walk(found: Survey, rig: Rig, frames: FrameTable, progress: Progress = silent) -> Walk:
     """Go over parts of a recording, evenly spread; raises DataError when an image is not of the calibrated size."""
     delays_s = np.full(len(frames.t_ns), np.nan)
     paired = frames.depth_rows >= 0
@@ -142,6 +143,7 @@ def walk(found: Survey, rig: Rig, frames: FrameTable) -> Walk:
                 loaded = loader.load(i)
                 if loaded.images:
                     part.see(i, loaded.images[0], loaded.depth_m, i == block[-1])
+                progress(i + 1, len(frames.t_ns), "colour and depth")
             ends += part.ends
             pairs += part.pairs
     return Walk(tuple(ends), tuple(pairs), sum(map(len, blocks)))

@@ -18,6 +18,7 @@ from vislam.core.clock import StageClock
 from vislam.core.errors import HardwareError
 from vislam.core.memory import Learned, SlamMemory, StartFacts
 from vislam.core.messages import Array, GraphUpdate
+from vislam.core.progress import Progress
 from vislam.core.recording import Recording
 from vislam.live.beginning import Beginning
 from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
@@ -33,7 +34,7 @@ from vislam.pipeline.back import MAX_SEEN, map_stage, seen_between
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.in_map import Place
 from vislam.pipeline.steps import Finish, KeyframeStep, Step
-from vislam.runs import Progress, Run, begun
+from vislam.runs import Run, begun
 from vislam.runs.folder import MapChoice
 from vislam.runs.session import Session, SessionWriter
 from vislam.runs.verdict import Evidence
@@ -112,7 +113,7 @@ class _LiveRun(Run):
         """Write all files; without map and pictures where the run has to end soon."""
         return super()._finish(start, is_brief or self._followed.life.is_brief)
 
-    def _feed(self, progress: Progress | None) -> None:
+    def _feed(self, progress: Progress) -> None:
         for step in self._followed.steps():
             was_found = self.joined_t_ns is not None
             self._take(step)

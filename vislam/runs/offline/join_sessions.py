@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,7 @@ from vislam.core.errors import TrackingLostError, UsageError
 from vislam.core.files import write_json, write_text
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, GraphUpdate, Submaps
+from vislam.core.progress import Progress, silent
 from vislam.factors import LoopModel, loop_record
 from vislam.graph.joining import JOIN_FRAMES, RelativeCovariance, Waiting
 from vislam.loop import LoopCloser
@@ -35,8 +36,6 @@ from vislam.runs.offline.session_graph import (
     weak_links,
 )
 from vislam.trajectory import Trajectory, write_tum
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +65,7 @@ class JoinedSessions:
     summary: dict[str, Any]
 
 
-def join_sessions(paths: Sequence[Path], progress: Progress | None = None, team: Team | None = None) -> JoinedSessions:
+def join_sessions(paths: Sequence[Path], progress: Progress = silent, team: Team | None = None) -> JoinedSessions:
     """Find loops between sessions (run folders or session files, only read) and optimise all of them as one graph.
 
     Loops between sessions are the only edges that may be found false. `team`: see `optimize_pose_graph`. Deterministic.
@@ -144,7 +143,7 @@ class _Search:
         """Return the session that a keyframe of the joined graph is of."""
         return int(np.searchsorted(self.first_ids, keyframe_id, side="right")) - 1
 
-    def run(self, progress: Progress | None) -> tuple[list[LoopModel], dict[int, int]]:
+    def run(self, progress: Progress) -> tuple[list[LoopModel], dict[int, int]]:
         """Return the loops between sessions, and by their ids the inliers of each."""
         detector = self._detector()
         newest_id, total = len(self.parts[0].poses) - 1, len(self.poses) - len(self.parts[0].poses)
@@ -162,8 +161,7 @@ class _Search:
                 found += models
                 if self._place(models):
                     detector.move(self._update())
-                if progress is not None:
-                    progress(newest_id + 1 - len(self.parts[0].poses), total, f"{len(found)} loops")
+                progress(newest_id + 1 - len(self.parts[0].poses), total, f"{len(found)} loops")
         detector.close()
         return found, inliers
 

@@ -21,6 +21,7 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.files import write_json
 from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
+from vislam.core.progress import Progress, silent
 from vislam.core.up import Up
 from vislam.factors import rig_from
 from vislam.frontend import knows_scale, mode_for
@@ -37,8 +38,6 @@ from vislam.runs.session import Session
 from vislam.runs.sources import open_source
 from vislam.trajectory import read_trajectory
 
-Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is being done
-
 # what is left of a depth image or stereo pair after these is all that a session keeps
 _EXTRACTION = (
     "min_range_m", "pixel_step", "edge_px", "speckle_pixels", "stereo_scale",
@@ -54,7 +53,7 @@ def map_settings(run: Path) -> Config:
         session.close()
 
 
-def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress: Progress | None) -> dict[str, Any]:
+def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress: Progress = silent) -> dict[str, Any]:
     """Make the maps of a run again into `out` (None: in the run's place); return what was written and what was not.
 
     `poses` is "graph" for the run's own, or names a `trajectory_NAME.tum` in its folder. Raises UsageError for a
@@ -80,7 +79,10 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         )
         mapper.move(nothing)
         total = len(placed) + len(config.products)
-        report = _reporter(progress, total)
+
+        def report(done: int, note: str) -> None:
+            progress(done, total, note)
+
         if from_session:
             _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, report)
         else:
@@ -124,14 +126,6 @@ def _levelled(
     level = Levelled(surest_up(mapper.views) if is_asked else Up.unknown(f"the run had --up {ran.up}"))
     T = level.T_level_map
     return level, mapper.turned(T), {i: T @ pose for i, pose in placed.items()}
-
-
-def _reporter(progress: Progress | None, total: int) -> Callable[[int, str], None]:
-    def report(done: int, note: str) -> None:
-        if progress is not None:
-            progress(done, total, note)
-
-    return report
 
 
 def _same_extraction(ran: MapConfig, config: MapConfig, rig: Rig) -> bool:
