@@ -57,8 +57,8 @@ def interrupted(
     watched = psutil.Process(process.pid)
     while process.poll() is None and not when(watched):
         time.sleep(0.005)
-    assert process.poll() is None, f"it had ended before the signal: {process.communicate()}"
-    (os.killpg if to_group else os.kill)(process.pid, number)
+    if process.poll() is None:  # else it was faster this time
+        (os.killpg if to_group else os.kill)(process.pid, number)
     try:
         _, said = process.communicate(timeout=HUNG_S)
     except subprocess.TimeoutExpired:
@@ -94,9 +94,8 @@ def check(ended: Ended, number: signal.Signals, moment: str) -> None:
 
 def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: Path) -> None:
     """Moments are shares of the CPU that it takes from its start to its last file, whatever the machine."""
-    rng = random.Random(SEED)
+    rng, out, interrupts = random.Random(SEED), tmp_path / "corridor", 0
     print("seed", SEED)
-    out = tmp_path / "corridor"
     arguments = ["simulate", "corridor-loop", "--duration-s", "1", "--image-width-px", "160", "--out"]
     for whole in (tmp_path / "first", tmp_path / "second"):
         whole_s, process = 0.0, started([*arguments, str(whole)])
@@ -110,11 +109,14 @@ def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: P
         number, share = SIGNALS[k % 3], rng.uniform(0.1, 0.9)
         reached = lambda process, spent_s=share * whole_s: cpu_s(process) >= spent_s  # noqa: E731
         ended = interrupted([*arguments, str(out)], reached, number, to_group=k % 2 == 0)
-        check(ended, number, f"moment {k}, {share:.2f} of {whole_s:.2f} s of CPU")
+        if ended.code != 0:
+            check(ended, number, f"moment {k}, {share:.2f} of {whole_s:.2f} s of CPU")
+            interrupts += 1
         made, wanted = ({p.relative_to(at) for p in (at / "mav0").rglob("*")} for at in (out, whole))
-        assert made in (set(), wanted)  # whole, where the signal came after its last file, or not at all
+        assert made == wanted or (made == set() and ended.code != 0)  # whole, or not at all
         if made:
             shutil.rmtree(out)  # a try that failed is in no other one's way
+    assert interrupts >= 3
 
 
 def test_a_live_run_ends_at_random_moments_and_can_be_started_again(tmp_path: Path) -> None:

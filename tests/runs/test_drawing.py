@@ -81,7 +81,6 @@ def test_labels_stand_above_in_rows_and_names_in_place_of_ticks() -> None:
 
 def test_drawings_are_stacked_and_as_files_have_colours_of_their_own() -> None:
     one = drawing([Lines(SQUARE, "graph", 1.0)], Axis("x"), Axis("y"), height_pt=100)
-    both = ElementTree.fromstring(stacked([one, one]))
-    assert both.get("viewBox") == "0 0 3960 2000"
+    assert (both := ElementTree.fromstring(stacked([one, one]))).get("viewBox") == "0 0 3960 2000"
     assert [g.get("transform") for g in both if g.get("transform")] == ["translate(0 0)", "translate(0 1000)"]
     assert "var(" not in as_file(one) and len(re.findall('stroke="#[0-9a-f]{6}"', as_file(one))) == 3

@@ -323,7 +323,7 @@ def test_a_run_in_a_level_map_that_was_ended_goes_on_in_its_frame(auto, source, 
     with pytest.raises(KeyboardInterrupt):
         execute(open_source(source, 0), CONFIG, out, "again", ["test"], stop, MapChoice(auto[1], False))
     _, config, base = read_setup(out)
-    metrics = resume(open_source(source, 0), config, out, "again", ["test"], None, base)
+    metrics = resume(open_source(source, 0), config, out, "again", ["test"], base=base)
     assert len(metrics["resumed"]) == 1
     assert metrics["up"]["source"] == "map"
     assert max(lean_deg(out, name) for name in ("live", "graph")) < 2.0
