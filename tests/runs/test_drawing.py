@@ -71,9 +71,9 @@ def test_a_line_is_broken_where_it_is_not_finite_and_ends_at_the_frame() -> None
 def test_labels_stand_above_in_rows_and_names_in_place_of_ticks() -> None:
     labels = [f"an estimate of {k}" for k in range(6)]
     lines = [Lines(SQUARE, "graph", 1.0, label=label) for label in labels]
-    text = drawing(lines, Axis("", ends=(0.0, 4.0)), Axis("", names=("track", "loop")), height_pt=230)
+    text = drawing(lines, Axis("", ends=(0.0, 4.0)), Axis("", names=("<track>", "loop")), height_pt=230)
     words = [t for t in ElementTree.fromstring(text).iter() if t.tag.endswith("text")]
-    assert [t.text for t in words] == ["track", "loop", *labels]
+    assert [t.text for t in words] == ["<track>", "loop", *labels]
     rows = sorted({float(t.get("y")) for t in words[2:]})
     assert len(rows) == 2 and min(at[:, 1].min() for at in drawn(text, "graph")[:1]) > rows[-1]
     assert all(float(t.get("x")) + 47 * len(t.text) < 3960 for t in words[2:])

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from vislam.core.messages import Array
-from vislam.runs.report.html import day_colors
+from vislam.runs.report.html import day_colors, escape
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 480, 70, 70, 360
 _FONT = 85
@@ -107,7 +107,7 @@ def _legend(lines: Sequence[Lines], width: int) -> tuple[str, int]:
         middle, half = np.array([at + 80, 70 + 120 * row]), np.array([80 * along, 40 * (up and not along)])
         sample = replace(group, width_pt=max(group.width_pt, 1.0), opacity=1.0)
         out += _path(sample, np.array([[middle - half, middle + half]]))
-        out += f'<text x="{at + 200}" y="{middle[1] + 30}" fill="var(--ink)">{group.label}</text>'
+        out += f'<text x="{at + 200}" y="{middle[1] + 30}" fill="var(--ink)">{escape(group.label)}</text>'
         at += wide
     return out, row + bool(out)
 
@@ -186,7 +186,7 @@ def _frame(x: Axis, y: Axis, ends: tuple[Array, Array], sides: tuple[int, int, i
 def _ticks(low: float, high: float, axis: Axis) -> list[tuple[float, str]]:
     """Return where ticks stand, in the numbers that are drawn, and what is written there."""
     if axis.names:
-        return [(float(k), name) for k, name in enumerate(axis.names)]
+        return [(float(k), escape(name)) for k, name in enumerate(axis.names)]
     if axis.log and high - low > 1.0:
         every = max(1, math.ceil((high - low) / _TICKS))
         return [(float(k), f"{10.0**k:g}") for k in range(math.ceil(low), math.floor(high) + 1) if k % every == 0]
