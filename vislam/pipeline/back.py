@@ -9,6 +9,7 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core import collector
+from vislam.core.blas import on_one_blas_thread
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
 from vislam.core.errors import UsageError
@@ -115,6 +116,7 @@ class Back:
         self.T_map_odom = np.eye(4)
         return True
 
+    @on_one_blas_thread
     def add(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> KeyframeStep:
         """Take one keyframe and the frames before it in: find its loops, optimise, follow with the map."""
         keyframe = odometry.packet.keyframe
@@ -145,6 +147,7 @@ class Back:
         record, words = self.graph.take_record(), self._new_words()
         return KeyframeStep(odometry, update, edges, candidates, retrieved, record, scans, words, tags)
 
+    @on_one_blas_thread
     def finish(self) -> GraphUpdate:
         """Optimise to convergence and bring the map to the final poses."""
         if self.loops is not None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from vislam.config import Config
+from vislam.core.blas import on_one_blas_thread
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
 from vislam.core.geometry import level_rotation, transform
@@ -150,6 +151,7 @@ class Front:
         most_s = _MAX_WAIT_S + max(offset_ns, 0) * 1e-9
         return (newest is not None and newest > frame_t_ns + offset_ns) or waited_s > most_s
 
+    @on_one_blas_thread
     def process(self, frame: Frame) -> FrontStep:
         """Track one frame, correct the filter with it, and hand over keyframes that are ready."""
         frame = self.camera_clock.in_imu_time(self.watch.see(frame))

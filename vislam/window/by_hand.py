@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from vislam.config import ImuConfig, MachineConfig, WindowConfig
+from vislam.core.blas import on_one_blas_thread
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import (
@@ -66,6 +67,7 @@ class Window:
         """The poses T_local_body [M, 4, 4] of the keyframes in the window, oldest first."""
         return np.empty((0, 4, 4)) if self._update is None else self._update.T_local_body
 
+    @on_one_blas_thread
     def add(
         self, t_ns: int, tracks: Observations, samples: Iterable[ImuSample] = (), T_local_body: Array | None = None
     ) -> WindowUpdate:

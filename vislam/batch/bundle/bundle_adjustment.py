@@ -28,6 +28,7 @@ from vislam.batch.bundle.rays import Mask, Tracks, collect, residuals, triangula
 from vislam.batch.bundle.shared_errors import Seen, SharedErrors, profiled
 from vislam.batch.bundle.shutter import ReadoutSearch, camera_twists, readout_change_s, shear
 from vislam.config import BatchConfig, Config
+from vislam.core.blas import on_one_blas_thread
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Array, NavState
@@ -72,6 +73,7 @@ class BatchResult:
     note: str  # what was out of the ordinary
 
 
+@on_one_blas_thread
 def optimize_run(log: FactorLog, config: Config, suite: Suite | None = None) -> BatchResult:
     """Estimate a run again from its factor log; deterministic. Readings of the sensors in `suite` are factors, too.
 

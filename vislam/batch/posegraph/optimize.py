@@ -18,6 +18,7 @@ from vislam.batch.posegraph.solver import Progress
 from vislam.batch.posegraph.starts import file_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
+from vislam.core.blas import on_one_blas_thread
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import UsageError
 from vislam.core.messages import Array
@@ -57,6 +58,7 @@ class PoseGraphSolution:
         return np.flatnonzero(self.weights == 0.0)
 
 
+@on_one_blas_thread
 def optimize_pose_graph(
     problem: PoseGraphProblem,
     config: PoseGraphConfig | None = None,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vislam.config import EkfConfig, MachineConfig
+from vislam.core.blas import on_one_blas_thread
 from vislam.core.geometry import so3_log
 from vislam.core.messages import Array, NavState, Observations, VoMeasurement
 from vislam.ekf.history import AtRest, Event
@@ -95,6 +96,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         self._counts["keyframes"] += 1
         return UpdateResult(True, float("nan"), "")
 
+    @on_one_blas_thread
     def update_vision(self, vo: VoMeasurement, observations: Observations, shows_scale: bool = True) -> UpdateResult:
         """Take the tracks of a frame; its motion only has its time and whether vision is lost.
 
