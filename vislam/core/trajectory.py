@@ -24,6 +24,7 @@ class Trajectory:
 
     t_ns: NDArray[np.int64]  # [N]
     T_world_body: Array  # [N, 4, 4]
+    has_rotation: bool = True  # else only positions are known, and rotations are the identity
 
     def __post_init__(self) -> None:
         stamps, poses = np.array(self.t_ns), np.array(self.T_world_body, dtype=np.float64)
@@ -91,7 +92,7 @@ class Trajectory:
         poses = self.T_world_body.copy()
         poses[:, :3, :3] = R @ self.T_world_body[:, :3, :3]
         poses[:, :3, 3] = scale * self.positions_m @ R.T + t
-        return Trajectory(self.t_ns, poses)
+        return Trajectory(self.t_ns, poses, self.has_rotation)
 
 
 def _interpolate_many(T_a: Array, T_b: Array, alpha: Array) -> Array:

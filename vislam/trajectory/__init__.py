@@ -1,15 +1,13 @@
 """Trajectories: the value, its files, and how one is judged against another."""
 
 from vislam.core.trajectory import Trajectory
+from vislam.trajectory.association import Pairs, associate, coverage
 from vislam.trajectory.consistency import Consistency, anees, nees
 from vislam.trajectory.evaluation import (
     Alignment,
-    Pairs,
     RelativeErrors,
     align,
-    associate,
     ate,
-    coverage,
     evaluate,
     gauge_alignment,
     rpe,

@@ -17,44 +17,12 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import align_points, invert, invert_many, sim3, sim3_parts
 from vislam.core.messages import Array
 from vislam.core.trajectory import Trajectory
+from vislam.trajectory.association import Association, Pairs, associate, coverage, usual_hole_s, why_few
 
 Alignment = Literal["se3", "sim3", "yaw", "first", "none"]
-Association = Literal["interpolate", "nearest"]
 
-_MAX_TRUTH_GAP_S = 0.1  # truth is interpolated across at most two samples of 20 Hz motion capture
-_MAX_NEAREST_S = 0.01  # as evo and the TUM tools
-_MAX_HOLE_S = 1.0  # a longer hole in the estimate counts as not covered
 _SEGMENTS_M = (1.0, 5.0, 10.0)
 _SEGMENT_TOLERANCE = 0.1  # of the length, as evo
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
-    """Poses of an estimate and of a reference at the same times."""
-
-    t_ns: NDArray[np.int64]  # [M]
-    estimate: Array  # [M, 4, 4]
-    reference: Array  # [M, 4, 4]
-    total: int  # poses of the estimate, matched or not
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def aligned(self, S_reference_estimate: Array) -> Pairs:
-        """Return the pairs with the estimate moved into the reference's world by a similarity [4, 4]."""
-        scale, R, t = sim3_parts(S_reference_estimate)
-        moved = self.estimate.copy()
-        moved[:, :3, :3] = R @ self.estimate[:, :3, :3]
-        moved[:, :3, 3] = scale * self.estimate[:, :3, 3] @ R.T + t
-        return Pairs(self.t_ns, moved, self.reference, self.total)
-
-    def position_errors_m(self) -> Array:
-        """Return the distances [M] in metres between estimate and reference as they stand."""
-        return np.linalg.norm(self.estimate[:, :3, 3] - self.reference[:, :3, 3], axis=1)
-
-    def rotation_errors_rad(self) -> Array:
-        """Return the angles [M] in radians between estimate and reference as they stand."""
-        return _angles_rad(self.estimate[:, :3, :3].transpose(0, 2, 1) @ self.reference[:, :3, :3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,19 +48,6 @@ class RelativeErrors:
         }
 
 
-def associate(
-    estimate: Trajectory, reference: Trajectory, method: Association = "interpolate", max_gap_s: float | None = None
-) -> Pairs:
-    """Pair the poses of two trajectories in time.
-
-    "interpolate" evaluates the reference at the estimate's times, across gaps of at most `max_gap_s` (0.1 s) and never
-    beyond its ends. "nearest" takes the closest pose within `max_gap_s` (0.01 s), led by the shorter one, as evo.
-    """
-    if method == "interpolate":
-        return _associate_interpolated(estimate, reference, _MAX_TRUTH_GAP_S if max_gap_s is None else max_gap_s)
-    return _associate_nearest(estimate, reference, _MAX_NEAREST_S if max_gap_s is None else max_gap_s)
-
-
 def align(pairs: Pairs, mode: Alignment) -> Array:
     """Return the similarity [4, 4] that brings the estimate's world into the reference's.
 
@@ -104,13 +59,12 @@ def align(pairs: Pairs, mode: Alignment) -> Array:
         raise UsageError(f"no alignment '{mode}'; there are: {', '.join(get_args(Alignment))}")
     needed = {"none": 0, "first": 1, "yaw": 2}.get(mode, 3)
     if len(pairs) < needed:
-        raise DataError(
-            f"alignment {mode} needs {needed} matching poses, got {len(pairs)} of {pairs.total}; "
-            "do both trajectories use the same clock?"
-        )
+        raise DataError(f"alignment {mode} needs {needed} matching poses, got {len(pairs)} of {pairs.total}")
     if mode == "none":
         return np.eye(4)
     if mode == "first":
+        if not pairs.has_rotation:
+            raise UsageError("alignment first needs rotations, there are positions only; use se3, sim3 or yaw")
         return np.asarray(pairs.reference[0] @ invert(pairs.estimate[0]))
     source, target = pairs.estimate[:, :3, 3], pairs.reference[:, :3, 3]
     if mode == "yaw":
@@ -121,7 +75,7 @@ def align(pairs: Pairs, mode: Alignment) -> Array:
 def ate(pairs: Pairs) -> dict[str, float]:
     """Return RMSE, mean, median and maximum of the position errors in metres, pairs taken as already aligned."""
     if not len(pairs):
-        raise DataError("no matching poses: do both trajectories use the same clock?")
+        raise DataError("no poses match in time")
     errors = pairs.position_errors_m()
     return {
         "rmse_m": float(np.sqrt(np.mean(errors**2))),
@@ -167,26 +121,6 @@ def scale_error(pairs: Pairs) -> float:
     return sim3_parts(align(pairs, "sim3"))[0] - 1.0
 
 
-def coverage(
-    estimate: Trajectory, reference: Trajectory, span_ns: tuple[int, int] | None = None, max_hole_s: float = _MAX_HOLE_S
-) -> float:
-    """Return which share of the time (that of the reference, or of `span_ns` within it) the estimate covers.
-
-    Holes of the estimate longer than `max_hole_s` are not covered.
-    """
-    if not len(estimate) or not len(reference):
-        return 0.0
-    first, last = int(reference.t_ns[0]), int(reference.t_ns[-1])
-    if span_ns is not None:
-        first, last = max(first, span_ns[0]), min(last, span_ns[1])
-    if last <= first:
-        return 0.0
-    stamps = np.clip(estimate.t_ns, first, last)
-    steps = np.diff(stamps)
-    held = np.diff(estimate.t_ns) <= max_hole_s * 1e9
-    return float(steps[held].sum() / (last - first))
-
-
 def gauge_alignment(has_gravity: bool, knows_scale: bool) -> Alignment:
     """Return how a run's trajectories may be moved onto the truth: by what no sensor of it can know.
 
@@ -205,65 +139,48 @@ def evaluate(
     *,
     association: Association = "interpolate",
     span_ns: tuple[int, int] | None = None,
+    max_gap_s: float | None = None,
+    max_hole_s: float | None = None,
 ) -> dict[str, Any]:
     """Return the accuracy entry of a run: ATE, RPE over 1 s and over 1, 5, 10 m, scale, coverage, path length.
 
-    `span_ns` is the time of the recording's frames; without it, coverage refers to the whole truth. Numbers that
-    cannot be computed are None. Raises DataError when too few poses match, UsageError for an unknown alignment.
+    `span_ns` is the time of the recording's frames; without it, coverage refers to the whole truth. Limits as in
+    `associate` and `coverage`. Numbers that cannot be computed are None: what needs rotations where one of the two has
+    positions only. Raises DataError when too few poses match, UsageError for an unknown alignment.
     """
     if alignment not in get_args(Alignment):
         raise UsageError(f"no alignment '{alignment}'; there are: {', '.join(get_args(Alignment))}")
     mode: Alignment = alignment  # type: ignore[assignment]
-    pairs = associate(estimate, truth, association)
-    S = align(pairs, mode)
-    aligned = pairs.aligned(S)
-    errors = ate(aligned)
-    over_time = rpe(aligned, duration_s=1.0).summary()
+    pairs = associate(estimate, truth, association, max_gap_s)
+    try:
+        aligned = pairs.aligned(align(pairs, mode))
+        errors = ate(aligned)
+    except DataError as error:
+        raise DataError(f"{error}; {why_few(pairs, estimate, truth)}") from error
+    over_time = _relative(aligned, duration_s=1.0)
     scale = 1.0 + scale_error(pairs) if len(pairs) >= 3 else float("nan")
     return {
         **{f"ate_{name}": value for name, value in errors.items()},
-        "rotation_rmse_deg": _rms(np.rad2deg(aligned.rotation_errors_rad())),
+        "rotation_rmse_deg": _rms(np.rad2deg(aligned.rotation_errors_rad())) if pairs.has_rotation else None,
         "alignment": mode,
         "association": association,
+        "at": "reference" if pairs.at_reference else "estimate",
+        "max_gap_s": pairs.limit_s,
+        "max_hole_s": usual_hole_s(estimate) if max_hole_s is None else max_hole_s,
         "scale": float(scale) if np.isfinite(scale) else None,
-        "coverage": coverage(estimate, truth, span_ns),
+        "coverage": coverage(estimate, truth, span_ns, max_hole_s),
         "matched": len(pairs),
         "total": pairs.total,
         "rpe_1s_m": over_time["m"],
         "rpe_1s_deg": over_time["deg"],
-        "rpe_segments": {f"{length:g}": rpe(aligned, length_m=length).summary() for length in _SEGMENTS_M},
+        "rpe_segments": {f"{length:g}": _relative(aligned, length_m=length) for length in _SEGMENTS_M},
         "path_m": float(np.linalg.norm(np.diff(pairs.reference[:, :3, 3], axis=0), axis=1).sum()),
     }
 
 
-def _associate_interpolated(estimate: Trajectory, reference: Trajectory, max_gap_s: float) -> Pairs:
-    if not len(reference) or not len(estimate):
-        return Pairs(np.empty(0, np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)), len(estimate))
-    times = reference.t_ns
-    after = np.searchsorted(times, estimate.t_ns, side="left")  # first reference time not before the estimate's
-    inside = (estimate.t_ns >= times[0]) & (estimate.t_ns <= times[-1])
-    after = np.clip(after, 0, len(times) - 1)
-    exact = times[after] == estimate.t_ns
-    gap = times[after] - times[np.maximum(after - 1, 0)]
-    chosen = inside & (exact | (gap <= max_gap_s * 1e9))
-    t_ns = estimate.t_ns[chosen]
-    matched = reference.at(t_ns) if len(t_ns) else np.empty((0, 4, 4))
-    return Pairs(t_ns, estimate.T_world_body[chosen], matched, len(estimate))
-
-
-def _associate_nearest(estimate: Trajectory, reference: Trajectory, max_difference_s: float) -> Pairs:
-    estimate_leads = len(estimate) <= len(reference)
-    lead, other = (estimate, reference) if estimate_leads else (reference, estimate)
-    if not len(lead):
-        return Pairs(np.empty(0, np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)), len(estimate))
-    right = np.clip(np.searchsorted(other.t_ns, lead.t_ns, side="right"), 0, len(other) - 1)
-    left = np.maximum(right - 1, 0)
-    take_left = np.abs(lead.t_ns - other.t_ns[left]) <= np.abs(other.t_ns[right] - lead.t_ns)
-    nearest = np.where(take_left, left, right)
-    chosen = np.abs(other.t_ns[nearest] - lead.t_ns) <= round(max_difference_s * 1e9)
-    of_lead, of_other = lead.T_world_body[chosen], other.T_world_body[nearest[chosen]]
-    pair = (of_lead, of_other) if estimate_leads else (of_other, of_lead)
-    return Pairs(lead.t_ns[chosen], *pair, len(estimate))
+def _relative(pairs: Pairs, duration_s: float | None = None, length_m: float | None = None) -> dict[str, float | None]:
+    """Return the summary of `rpe`; of none where a rotation is not known, since relative motions are turned by it."""
+    return rpe(pairs if pairs.has_rotation else pairs.without_any(), duration_s, length_m).summary()
 
 
 def _align_yaw(source: Array, target: Array) -> Array:
