@@ -125,8 +125,8 @@ def with_own_of_graph(sensors: dict[str, dict[str, Any]], graph: FinalGraph | No
 
 
 def _truth_entry(spans: Sequence[ImuSpan], truth: Trajectory, alignment: Alignment) -> dict[str, Any]:
-    """Return how good a truth is by inertial samples; empty without samples."""
-    if not spans:
+    """Return how good a truth is by inertial samples; empty without samples, or where it has positions only."""
+    if not spans or not truth.has_rotation:
         return {}
     from vislam.trajectory.truth_fit import fit_truth  # takes its time to be loaded
 

@@ -1,7 +1,7 @@
 """Trajectories: the value, its files, and how one is judged against another."""
 
 from vislam.core.trajectory import Trajectory
-from vislam.trajectory.association import Pairs, associate, coverage
+from vislam.trajectory.association import Pairs, associate, coverage, spans
 from vislam.trajectory.consistency import Consistency, anees, nees
 from vislam.trajectory.evaluation import (
     Alignment,
@@ -16,17 +16,18 @@ from vislam.trajectory.evaluation import (
 from vislam.trajectory.formats import (
     read_euroc,
     read_kitti,
-    read_trajectory,
     read_tum,
     write_kitti,
     write_tum,
 )
+from vislam.trajectory.recognised import Recognised, read_trajectory, recognise
 from vislam.trajectory.states import read_states_csv, write_states_csv
 
 __all__ = [
     "Alignment",
     "Consistency",
     "Pairs",
+    "Recognised",
     "RelativeErrors",
     "Trajectory",
     "align",
@@ -42,8 +43,10 @@ __all__ = [
     "read_states_csv",
     "read_trajectory",
     "read_tum",
+    "recognise",
     "rpe",
     "scale_error",
+    "spans",
     "write_kitti",
     "write_states_csv",
     "write_tum",

@@ -21,7 +21,7 @@ Association = Literal["interpolate", "nearest"]
 _GAP_S = 0.1  # interpolated across: at most two samples of 20 Hz motion capture, and of slower ones
 _NEAREST_S = 0.01  # as evo and the TUM tools, or half the interval of the faster one
 _HOLE_S = 1.0  # a longer hole in the estimate counts as not covered, in a slow one 2.5 intervals
-_SLOWER = 1.5  # times the estimate's interval, and beyond _GAP_S: such a reference is not interpolated itself
+_SLOWER = 1.5  # times the estimate's interval, and beyond _GAP_S: a path bends between poses of such a reference
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Pairs:
     reference: Array  # [M, 4, 4]
     total: int  # poses whose times were asked for, matched or not
     limit_s: float = 0.0  # the longest gap that was interpolated across, or the largest difference in time
-    at_reference: bool = False  # whether the times are the reference's
+    at_reference: bool = False  # whether the reference's poses were asked for, else the estimate's
     has_rotation: bool = True  # of both; else the rotations mean nothing
 
     def __len__(self) -> int:
@@ -66,10 +66,10 @@ def associate(
 ) -> Pairs:
     """Pair the poses of two trajectories in time.
 
-    "interpolate" evaluates the reference at the estimate's times; where the reference has fewer than 10 poses a second
-    and the estimate clearly more, the estimate at the reference's. It never goes beyond the ends, nor across gaps of
-    more than `max_gap_s` (default: 0.1 s, or two usual intervals). "nearest" takes the closest pose within `max_gap_s`
-    (default: 0.01 s, or half the usual interval of the faster one), led by the shorter one, as evo.
+    "interpolate" evaluates the reference at the estimate's times, never beyond its ends, nor across gaps of more than
+    `max_gap_s` (default: 0.1 s, or two usual intervals). Where it has fewer than 10 poses a second and the estimate
+    clearly more, only the pose of the estimate next to each of its own is taken. "nearest" takes the closest pose
+    within `max_gap_s` (default: 0.01 s, or half the usual interval of the faster one), led by the shorter one, as evo.
     """
     intervals_s = usual_interval_s(estimate), usual_interval_s(reference)
     has_rotation = estimate.has_rotation and reference.has_rotation
@@ -77,14 +77,12 @@ def associate(
         limit_s = max(_NEAREST_S, 0.5 * min(intervals_s)) if max_gap_s is None else max_gap_s
         at_reference = len(reference) < len(estimate)
         lead, other = (reference, estimate) if at_reference else (estimate, reference)
-        t_ns, own, others = _nearest(lead, other, limit_s)
-    else:
-        at_reference = intervals_s[1] > max(_GAP_S, _SLOWER * intervals_s[0])
-        lead, other = (reference, estimate) if at_reference else (estimate, reference)
-        limit_s = max(_GAP_S, 2.0 * usual_interval_s(other)) if max_gap_s is None else max_gap_s
-        t_ns, own, others = _interpolated(lead, other, limit_s)
-    poses = (others, own) if at_reference else (own, others)
-    return Pairs(t_ns, *poses, len(lead), limit_s, at_reference, has_rotation)
+        t_ns, *poses = _nearest(lead, other, limit_s)
+        return Pairs(t_ns, *(poses[::-1] if at_reference else poses), len(lead), limit_s, at_reference, has_rotation)
+    limit_s = max(_GAP_S, 2.0 * intervals_s[1]) if max_gap_s is None else max_gap_s
+    at_reference = intervals_s[1] > max(_GAP_S, _SLOWER * intervals_s[0])
+    asked, total = (_next_to(estimate, reference), len(reference)) if at_reference else (estimate, len(estimate))
+    return Pairs(*_interpolated(asked, reference, limit_s), total, limit_s, at_reference, has_rotation)
 
 
 def usual_interval_s(trajectory: Trajectory) -> float:
@@ -144,6 +142,20 @@ def why_few(pairs: Pairs, estimate: Trajectory, reference: Trajectory) -> str:
         f"the estimate has a pose every {every[0]}, the reference every {every[1]}, and {pairs.limit_s:.3g} s apart is "
         f"the limit; {spans(estimate, reference)}; a longer --max-gap-s allows more"
     )
+
+
+def _next_to(estimate: Trajectory, reference: Trajectory) -> Trajectory:
+    """Return the poses of an estimate within a slower reference that are next to its own, an interval away at most."""
+    inside = (estimate.t_ns >= reference.t_ns[0]) & (estimate.t_ns <= reference.t_ns[-1])
+    t_ns, poses = estimate.t_ns[inside], estimate.T_world_body[inside]
+    if len(t_ns):
+        right = np.clip(np.searchsorted(t_ns, reference.t_ns), 1, max(len(t_ns) - 1, 1)).clip(max=len(t_ns) - 1)
+        left = np.maximum(right - 1, 0)
+        row = np.where(reference.t_ns - t_ns[left] <= t_ns[right] - reference.t_ns, left, right)
+        near = np.abs(t_ns[row] - reference.t_ns) <= usual_interval_s(estimate) * 1e9
+        row = np.unique(row[near])
+        t_ns, poses = t_ns[row], poses[row]
+    return Trajectory(t_ns, poses, estimate.has_rotation)
 
 
 def _interpolated(lead: Trajectory, other: Trajectory, limit_s: float) -> tuple[NDArray[np.int64], Array, Array]:

@@ -14,7 +14,7 @@ from vislam.core.chi_square import chi_square_limit
 from vislam.core.errors import DataError
 from vislam.core.messages import Array, NavState
 from vislam.core.trajectory import Trajectory
-from vislam.trajectory.evaluation import associate
+from vislam.trajectory.association import associate
 
 if TYPE_CHECKING:
     from vislam.trajectory.truth_fit import TruthFit

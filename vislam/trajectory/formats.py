@@ -41,7 +41,7 @@ def read_tum(path: Path) -> Trajectory:
     """
     stamps, numbers, lines = read_table(path, separator=None, columns=(8,))
     t_ns = np.array([stamp_ns(text, 1e9, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
-    return _trajectory(t_ns, numbers[:, 0:3], numbers[:, 3:7], path, lines)
+    return trajectory_of_rows(t_ns, (numbers[:, 0:3], numbers[:, 3:7]), path, lines)
 
 
 @paused()
@@ -58,9 +58,17 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
 def read_kitti(path: Path, times: Path | NDArray[np.int64]) -> Trajectory:
     """Read a KITTI pose file (12 numbers of a row-major 3x4 matrix per line) with its times file or times in ns [N]."""
     _, numbers, lines = read_table(path, separator=None, columns=(12,), with_stamp=False)
-    t_ns = _read_kitti_times(times) if isinstance(times, Path) else np.asarray(times, dtype=np.int64)
-    if len(t_ns) != len(numbers):
-        raise DataError(f"{path} has {len(numbers)} poses but there are {len(t_ns)} times; give the times of this file")
+    if isinstance(times, Path):
+        t_ns = read_kitti_times(times, len(numbers), path)
+    else:
+        t_ns = np.asarray(times, dtype=np.int64)
+        _check_count(len(t_ns), len(numbers), path)
+        _check_increasing(t_ns, path, lines)
+    return Trajectory(t_ns, kitti_poses(numbers, path, lines))
+
+
+def kitti_poses(numbers: Array, path: Path, lines: list[int]) -> Array:
+    """Return poses [N, 4, 4] of rows [N, 12] of 3x4 matrices; raises DataError for what is no rotation or too far."""
     _check_reach(numbers, path, lines)
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     poses[:, :3, :4] = numbers.reshape(-1, 3, 4)
@@ -70,8 +78,7 @@ def read_kitti(path: Path, times: Path | NDArray[np.int64]) -> Trajectory:
     if wrong.any():
         raise DataError(f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is not a rotation")
     poses[:, :3, :3] = R
-    _check_increasing(t_ns, times if isinstance(times, Path) else path, lines)
-    return Trajectory(t_ns, poses)
+    return poses
 
 
 @paused()
@@ -89,18 +96,11 @@ def read_euroc(path: Path) -> Trajectory:
     """
     stamps, numbers, lines = read_table(path, separator=",", columns=(8, 17))
     t_ns = np.array([stamp_ns(text, 1, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
-    return _trajectory(t_ns, numbers[:, 0:3], numbers[:, [4, 5, 6, 3]], path, lines)
+    return trajectory_of_rows(t_ns, (numbers[:, 0:3], numbers[:, [4, 5, 6, 3]]), path, lines)
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM or EuRoC trajectory file, distinguished by the comma in its first line of data."""
-    for _, line in _data_lines(path):
-        return read_euroc(path) if "," in line else read_tum(path)
-    raise DataError(f"{path} holds no poses")
-
-
-def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield (line number, stripped line) of what is neither empty nor a comment."""
+def data_lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[int, str]]:
+    """Yield (line number, stripped line) of what is neither empty nor a comment (# or %); these go to `comments`."""
     try:
         size = path.stat().st_size
         if size > _MAX_BYTES:
@@ -111,9 +111,11 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
                 number += 1
                 if len(raw) == _MAX_LINE_BYTES:
                     raise DataError(f"{path}:{number}: line longer than {_MAX_LINE_BYTES} bytes; not a trajectory file")
-                line = raw.decode("utf-8").strip()
-                if line and not line.startswith("#"):
+                line = raw.decode("utf-8").strip().removeprefix("\ufeff")  # the mark of bytes' order
+                if line and not line.startswith(("#", "%")):
                     yield number, line
+                elif line and comments is not None:
+                    comments.append(line.lstrip("#% "))
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -137,7 +139,7 @@ def read_table(
     rows: list[list[float]] = []
     lines: list[int] = []
     width = 0
-    for number, line in _data_lines(path):
+    for number, line in data_lines(path):
         fields = line.split(separator)
         if header is not None:
             if fields != header:
@@ -147,7 +149,8 @@ def read_table(
         width = width or len(fields)
         if len(fields) not in columns or len(fields) != width:
             wanted = width if width in columns else " or ".join(str(count) for count in columns)
-            raise DataError(f"{path}:{number}: expected {wanted} columns, got {len(fields)}; is the line cut short?")
+            why = "" if width in columns else f"; {why_columns(len(fields))}"
+            raise DataError(f"{path}:{number}: expected {wanted} columns, got {len(fields)}{why}")
         try:
             if "_" in line:  # Python would read 1_0 as ten
                 raise ValueError("'_' is not part of a number")
@@ -177,29 +180,73 @@ def stamp_ns(text: str, unit_ns: float, path: Path, line: int) -> int:
     return int((value * int(unit_ns)).to_integral_value())
 
 
-def _read_kitti_times(path: Path) -> NDArray[np.int64]:
-    stamps, _, lines = read_table(path, separator=None, columns=(1,))
-    t_ns = np.array([stamp_ns(text, 1e9, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
-    _check_increasing(t_ns, path, lines)
+def why_columns(count: int) -> str:
+    """Return in words what rows of `count` numbers are, for a reader that does not take them."""
+    known = {
+        7: "7 numbers, perhaps a pose without a time: put the time before each",
+        12: "12 numbers, a 3x4 matrix as of KITTI if its left part is a rotation, which wants times beside it",
+        13: "13 numbers, a stamp and a 3x4 matrix if its left part is a rotation",
+    }
+    wanted = (
+        "read are t x y z qx qy qz qw, the same with a header that names further columns or another order, EuRoC's "
+    )
+    return f"{known.get(count, f'{count} numbers in which no pose is found')}; {wanted}and KITTI's 12"
+
+
+def read_kitti_times(times: Path, poses: int, path: Path) -> NDArray[np.int64]:
+    """Return the times [poses] in ns, a row in seconds each, for the poses in `path`; raises DataError."""
+    stamps, _, lines = read_table(times, separator=None, columns=(1,))
+    t_ns = np.array([stamp_ns(text, 1e9, times, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
+    _check_count(len(t_ns), poses, path)
+    _check_increasing(t_ns, times, lines)
     return t_ns
 
 
-def _trajectory(t_ns: NDArray[np.int64], positions: Array, q_xyzw: Array, path: Path, lines: list[int]) -> Trajectory:
+def _check_count(times: int, poses: int, path: Path) -> None:
+    if times != poses:
+        raise DataError(f"{path} has {poses} poses but there are {times} times; give the times of this file")
+
+
+def gives_rotation(q_xyzw: Array, identity_is_none: bool) -> bool:
+    """Return whether quaternions [N, 4] say anything: they do not if all are zero.
+
+    With `identity_is_none`, neither if all are the identity, with w at either end: so positions are written as poses.
+    """
+    is_same = bool((q_xyzw == q_xyzw[:1]).all())
+    none = [np.zeros(4), *([np.eye(4)[0], np.eye(4)[3]] if identity_is_none else [])]
+    return not (is_same and len(q_xyzw) and any((np.abs(q_xyzw[0]) == quaternion).all() for quaternion in none))
+
+
+def trajectory_of_rows(
+    t_ns: NDArray[np.int64], given: Array | tuple[Array, Array], path: Path, lines: list[int], *,
+    identity_is_none: bool = False,
+) -> Trajectory:  # fmt: skip
+    """Return the trajectory of rows: poses [N, 4, 4], or positions [N, 3] and quaternions x y z w [N, 4].
+
+    Of poses of one time the first is taken, which is stated. Raises DataError with file and line for times that go
+    back, for what is too far, and for quaternions that are none; if none gives a rotation, it has positions only.
+    """
+    kept = np.ones(len(t_ns), dtype=bool)
     if (np.diff(t_ns) == 0).any() and (np.diff(t_ns) >= 0).all():
         judge = StreamJudge(path.name)
-        is_new = np.array([judge.takes(t) for t in t_ns.tolist()], dtype=bool)
+        kept = np.array([judge.takes(t) for t in t_ns.tolist()], dtype=bool)
         _LOG.warning("%s", "; ".join(e.words(int(t_ns[0])) for e in judge.events if e.happening is Happening.DUPLICATE))
-        t_ns, positions, q_xyzw, lines = t_ns[is_new], positions[is_new], q_xyzw[is_new], list(compress(lines, is_new))
+        t_ns, lines = t_ns[kept], list(compress(lines, kept))
     _check_increasing(t_ns, path, lines)
+    if not isinstance(given, tuple):
+        return Trajectory(t_ns, given[kept])
+    positions, q_xyzw = given[0][kept], given[1][kept]
     _check_reach(positions, path, lines)
+    poses = np.tile(np.eye(4), (len(t_ns), 1, 1))
+    poses[:, :3, 3] = positions
+    if not gives_rotation(q_xyzw, identity_is_none):
+        return Trajectory(t_ns, poses, has_rotation=False)
     norms = np.linalg.norm(q_xyzw, axis=1)
     wrong = np.abs(norms - 1.0) > _QUATERNION_NORM_TOLERANCE
     if wrong.any():
         i = int(np.argmax(wrong))
         raise DataError(f"{path}:{lines[i]}: quaternion has norm {norms[i]:.4g} instead of 1")
-    poses = np.tile(np.eye(4), (len(t_ns), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(q_xyzw).as_matrix()
-    poses[:, :3, 3] = positions
     return Trajectory(t_ns, poses)
 
 
@@ -218,6 +265,6 @@ def _check_increasing(t_ns: NDArray[np.int64], path: Path, lines: list[int]) -> 
 
 
 def _quaternions_xyzw(trajectory: Trajectory) -> Array:
-    if not len(trajectory):
-        return np.empty((0, 4))
+    if not len(trajectory) or not trajectory.has_rotation:
+        return np.zeros((len(trajectory), 4))
     return quaternion_xyzw_from_rotation(trajectory.T_world_body[:, :3, :3])

@@ -30,7 +30,8 @@ from vislam.core.messages import Array
 from vislam.core.trajectory import Trajectory
 from vislam.imu.gyro_turns import integrate_gyro
 from vislam.imu.path import SmoothAttitude, apart, drift_knots, gaps, integrate_twice, mean_rate_ahead
-from vislam.trajectory.evaluation import Alignment, align, associate, ate
+from vislam.trajectory.association import associate
+from vislam.trajectory.evaluation import Alignment, align, ate
 
 _SURE = 0.999  # of a turn, a lever or an offset taken for real: one recording in a thousand is changed by chance
 _TURN_EVERY_S, _PLACE_EVERY_S = 0.1, 0.04  # true poses that are looked at

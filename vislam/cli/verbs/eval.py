@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from tyro.conf import Positional
@@ -14,8 +14,12 @@ from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.results import print_evaluation, print_truth
 from vislam.cli.verbs.terminal import number, print_table
 from vislam.config import LoopTruthConfig
-from vislam.config.ranges import Share
-from vislam.core.errors import DataError, TrackingLostError, UsageError
+from vislam.config.ranges import Positive, Share
+from vislam.core.errors import DataError, TrackingLostError, UsageError, printable
+
+if TYPE_CHECKING:
+    from vislam.core.trajectory import Trajectory
+    from vislam.trajectory import Recognised
 
 
 @dataclass(frozen=True)
@@ -23,13 +27,26 @@ class EvalOptions:
     """Options of `vislam eval`."""
 
     estimate: Positional[Path]
-    """A trajectory file (TUM, EuRoC csv) or a run folder"""
+    """A trajectory (TUM, EuRoC, KITTI, VINS, ORB-SLAM, evo: recognised), a bag with --topic, or a run folder"""
     reference: Path | None = None
-    """True trajectory; a run folder brings its own"""
-    align: Literal["se3", "sim3", "yaw", "first", "none"] = "se3"
-    """How the estimate is moved onto the reference before errors are taken"""
+    """True trajectory, as the estimate; a run folder brings its own"""
+    topic: str = ""
+    """Of a bag: Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped, PointStamped or Path; default: its only"""
+    reference_topic: str = ""
+    """Of a bag as --reference"""
+    times: Path | None = None
+    """Times of an estimate without any (KITTI); default: times.txt beside it"""
+    reference_times: Path | None = None
+    """Times of a reference without any; default: times.txt beside it, or --times"""
+    align: Literal["se3", "sim3", "yaw", "first", "none"] | None = None
+    """How the estimate is moved onto the reference before errors are taken; default: se3, of a run as in its report"""
     association: Literal["interpolate", "nearest"] = "interpolate"
-    """Interpolate the reference at the estimate's times, or take the nearest pose within 10 ms"""
+    """Interpolate the reference at the estimate's times, or take the nearest pose"""
+    max_gap_s: Positive | None = None
+    """Longest gap to interpolate across; default: 0.1 s or two intervals; with nearest: largest difference in time,
+    default: 10 ms or half an interval"""
+    max_hole_s: Positive | None = None
+    """Longer holes of the estimate are not covered; default: 1 s or 2.5 intervals"""
     min_coverage: Share = 0.8
     """Below this share of the reference's time the evaluation fails with exit code 4"""
     loops: bool = False
@@ -47,45 +64,92 @@ def main(arguments: list[str]) -> int:
     options = parse(EvalOptions, arguments, "eval")
     if options.loops:
         return _eval_loops(options)
-    results = _evaluate(options)
+    results, taken_for = _evaluate(options)
     if options.json:
-        print(json.dumps(results))
+        print(json.dumps({name: entry | taken_for for name, entry in results.items()}))
     else:
+        for role, words in taken_for.items():
+            Console().print(f"{role}: {printable(words)}", soft_wrap=True, markup=False, highlight=False)
         print_evaluation(results)
         if options.reference is None:
             from vislam.runs.folder import read_metrics  # not before --help has answered
 
             print_truth(read_metrics(options.estimate))
-    covered = min(entry["coverage"] for entry in results.values())
-    if covered < options.min_coverage:
+    name, worst = min(results.items(), key=lambda item: item[1]["coverage"])
+    if worst["coverage"] < options.min_coverage:
         raise TrackingLostError(
-            f"the estimate covers {covered:.0%} of the reference, {options.min_coverage:.0%} asked; "
-            "check that both use the same clock, or lower --min-coverage"
+            f"{name} covers {worst['coverage']:.0%} of the reference's time, {options.min_coverage:.0%} asked; "
+            f"{worst['spans']}; holes over {worst['max_hole_s']:.3g} s are not covered; --min-coverage sets the share"
         )
     return 0
 
 
-def _evaluate(options: EvalOptions) -> dict[str, dict[str, Any]]:
-    """Return the errors of each trajectory by its name."""
-    from vislam.trajectory import evaluate, read_trajectory
+def _evaluate(options: EvalOptions) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Return the errors of each trajectory by its name, and what estimate and reference were taken for."""
+    from vislam.runs.offline.evaluated import is_run, read_evaluated
+    from vislam.trajectory import evaluate, spans
 
-    estimate, reference = options.estimate, options.reference
-    paths = {estimate.name: estimate}
-    if estimate.is_dir():
-        paths = {p.stem.removeprefix("trajectory_"): p for p in sorted(estimate.glob("trajectory_*.tum"))}
-        truth = paths.pop("truth", None)
-        reference = reference or truth
-    if not estimate.exists():
-        raise UsageError(f"{estimate} does not exist; give a run folder, or a trajectory file and --reference FILE")
-    if reference is None:
-        raise UsageError(f"{estimate} brings no truth to be evaluated against; give --reference FILE")
-    if not paths:
-        raise DataError(f"{estimate} holds no trajectory_*.tum; give a run folder or a trajectory file")
-    true = read_trajectory(reference)
+    path, span_ns, align = options.estimate, None, options.align or "se3"
+    truth: Trajectory | None = None
+    taken_for = {}
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; give a run folder, or a trajectory and --reference FILE")
+    if is_run(path):
+        run = read_evaluated(path)
+        estimates, truth, span_ns, align = run.estimates, run.truth, run.span_ns, options.align or run.alignment
+        taken_for["estimate"] = f"{path}, a run; aligned {'as asked' if options.align else 'as its report'}"
+        taken_for["reference"] = f"{path}, its own truth"
+        timed = True
+    else:
+        found = _read(path, options.topic, options.times)
+        estimates, timed = {path.name: found.trajectory}, found.timed
+        taken_for["estimate"] = f"{path.name}: {found.taken_for}"
+    if options.reference is not None:
+        found = _reference(options)
+        truth = found.trajectory
+        taken_for["reference"] = f"{options.reference.name}: {found.taken_for}"
+        _check_times(timed, found.timed, max(map(len, estimates.values())), len(truth))
+    elif truth is None:
+        raise UsageError(f"{path} brings no truth to be evaluated against; give --reference FILE")
+    settings: dict[str, Any] = {"max_gap_s": options.max_gap_s, "max_hole_s": options.max_hole_s}
     return {
-        name: evaluate(read_trajectory(path), true, options.align, association=options.association)
-        for name, path in paths.items()
-    }
+        name: evaluate(estimate, truth, align, association=options.association, span_ns=span_ns, **settings)
+        | {"spans": spans(estimate, truth)}
+        for name, estimate in estimates.items()
+    }, taken_for
+
+
+def _reference(options: EvalOptions) -> Recognised:
+    """Return the reference; one without times may take those of the estimate."""
+    assert options.reference is not None
+    times = options.reference_times
+    found = _read(options.reference, options.reference_topic, times)
+    return found if found.timed or not options.times else _read(options.reference, "", options.times)
+
+
+def _read(path: Path, topic: str, times: Path | None) -> Recognised:
+    """Return the trajectory in a file, or on a topic of a bag."""
+    from vislam.datasets.bags import is_bag, trajectory_of_topic
+    from vislam.trajectory import Recognised, recognise
+
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; give a trajectory file, or a bag and its topic")
+    if is_bag(path):
+        return Recognised(*trajectory_of_topic(path, topic))
+    if topic:
+        raise UsageError(f"{path} is no bag, and has no topic {topic}; leave it out")
+    return recognise(path, times)
+
+
+def _check_times(estimate_timed: bool, reference_timed: bool, poses: int, true_poses: int) -> None:
+    """Raise DataError where poses without times cannot be paired row by row."""
+    if estimate_timed != reference_timed:
+        which = ("reference", "--reference-times") if estimate_timed else ("estimate", "--times")
+        raise DataError(f"the {which[0]} has no times; put times.txt beside it, or give {which[1]} FILE")
+    if not estimate_timed and poses != true_poses:
+        raise DataError(
+            f"neither has times, and {poses} poses against {true_poses} cannot be paired; give --times FILE"
+        )
 
 
 def _eval_loops(options: EvalOptions) -> int:

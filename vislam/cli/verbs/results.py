@@ -50,16 +50,41 @@ def _print_cost(console: Console, cost: dict[str, Any]) -> None:
 
 
 def print_evaluation(results: dict[str, dict[str, Any]]) -> None:
-    """Print the errors of trajectories, as `evaluate` returns them, by name."""
+    """Print the errors of trajectories, as `evaluate` returns them, by name, and what they mean; in 80 columns."""
     columns = {
-        "ATE rmse [m]": "ate_rmse_m", "median": "ate_median_m", "max": "ate_max_m", "RPE 1 s [m]": "rpe_1s_m",
-        "RPE 1 s [deg]": "rpe_1s_deg", "scale": "scale",
+        "ATE\nrmse m": "ate_rmse_m", "ATE\nmedian": "ate_median_m", "ATE\nmax m": "ate_max_m",
+        "RPE\n1 s m": "rpe_1s_m", "RPE\n1 s deg": "rpe_1s_deg", "best\nscale": "scale",
     }  # fmt: skip
     rows = []
     for name, entry in results.items():
-        numbers = [number(entry[key], 4) for key in columns.values()]
+        numbers = [_short(entry[key]) for key in columns.values()]
         rows.append((name, *numbers, f"{entry['matched']}/{entry['total']}", f"{entry['coverage']:.0%}"))
-    print_table(("trajectory", *columns, "matched", "covered"), rows)
+    print_table(("trajectory", *columns, "matched", "covered"), rows, margin=0)
+    for words in dict.fromkeys(_meaning(entry) for entry in results.values()):
+        Console().print(words, highlight=False)
+
+
+_ALIGNED = {
+    "se3": "aligned by SE(3), scale kept", "sim3": "aligned by Sim(3), scale too", "none": "not aligned",
+    "yaw": "aligned by yaw and position, scale kept", "first": "aligned at the first pose, scale kept",
+}  # fmt: skip
+
+
+def _meaning(entry: dict[str, Any]) -> str:
+    """Return alignment, units and association of an entry in words."""
+    gap_s, own = f"{entry['max_gap_s']:.3g} s", entry["at"] == "estimate"
+    paired = (
+        f"reference interpolated at the estimate's times{'' if own else ' next to its own'}, across {gap_s} at most"
+    )
+    if entry["association"] == "nearest":
+        paired = f"paired with the nearest pose within {gap_s}"
+    unknown = "" if entry["rotation_rmse_deg"] is not None else "; positions only: no rotation and no relative errors"
+    return f"Metres and degrees, {_ALIGNED[entry['alignment']]}; {paired}{unknown}."
+
+
+def _short(value: float | None) -> str:
+    """Write a number in seven places: four digits behind the point, fewer of a large one."""
+    return "-" if value is None else number(value, max(0, 4 - max(0, len(f"{abs(value):.0f}") - 1)))
 
 
 def _print_verdict(console: Console, verdict: dict[str, Any]) -> None:

@@ -77,13 +77,17 @@ def _now_and_then() -> Callable[[str], None]:
 
 
 def print_table(
-    columns: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None, words: Sequence[str] | None = None
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    title: str | None = None,
+    words: Sequence[str] | None = None,
+    margin: int = 1,
 ) -> None:
     """Print a table whose columns are numbers, set to the right, but for those of `words` (None: the first)."""
-    table = Table(title=title)
+    table = Table(title=title, padding=(0, margin))
     left = columns[:1] if words is None else words
     for column in columns:
-        table.add_column(column, justify="left" if column in left else "right")
+        table.add_column(column, justify="left" if column in left else "right", overflow="fold")
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     Console().print(table)

@@ -8,11 +8,15 @@ from pathlib import Path
 from vislam.config import validated
 from vislam.datasets.bags.bag import SUFFIXES, is_bag
 from vislam.datasets.bags.choice import BagOptions
+from vislam.datasets.bags.poses import trajectory_of_topic
 from vislam.datasets.bags.surveying import survey_bag
 from vislam.datasets.bags.topic_readings import first_fix, readings_of_topic
 from vislam.datasets.stream import Survey
 
-__all__ = ["LOOKS_FOR", "SUFFIXES", "first_fix", "is_bag", "readings_of_topic", "recognises", "survey", "survey_with"]
+__all__ = [
+    "LOOKS_FOR", "SUFFIXES", "first_fix", "is_bag", "readings_of_topic", "recognises", "survey", "survey_with",
+    "trajectory_of_topic",
+]  # fmt: skip
 
 LOOKS_FOR = f"a bag ({', '.join(SUFFIXES)}, or a folder with such files)"
 recognises = is_bag

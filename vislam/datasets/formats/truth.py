@@ -17,6 +17,7 @@ from vislam.core.recording import Problems
 from vislam.datasets.images import Stamps
 from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, in_time_order, parse_seconds, read_numbers
 from vislam.trajectory import Trajectory, read_kitti
+from vislam.trajectory.formats import gives_rotation
 
 Truth = Callable[[Problems], Trajectory | None]
 
@@ -48,10 +49,16 @@ def kitti_truth(path: Path, t_ns: Stamps) -> Truth:
 
 
 def trajectory_of(rows: Iterable[Row[list[float]]], problems: Problems, T_sensor_body: Array) -> Trajectory | None:
-    """Return the body's trajectory of rows t, x, y, z, qx, qy, qz, qw of a sensor; None without usable rows."""
+    """Return the body's trajectory of rows t, x, y, z, qx, qy, qz, qw of a sensor; None without usable rows.
+
+    Rows that all have the same empty rotation give positions only.
+    """
     kept = list(in_time_order(rows, problems, "truth"))
     values = np.array([row[1] for row in kept]).reshape(-1, 7)
     t_ns = np.array([row[0] for row in kept], dtype=np.int64)
+    has_rotation = gives_rotation(values[:, 3:], identity_is_none=True)
+    if not has_rotation:
+        values[:, 3:] = [0.0, 0.0, 0.0, 1.0]
     usable = np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < 0.1
     problems.count("truth: quaternion that is not of unit norm", times=int(np.count_nonzero(~usable)))
     if not usable.any():
@@ -59,4 +66,4 @@ def trajectory_of(rows: Iterable[Row[list[float]]], problems: Problems, T_sensor
     T = np.tile(np.eye(4), (int(usable.sum()), 1, 1))
     T[:, :3, :3] = rotation_from_quaternion_xyzw(values[usable, 3:])
     T[:, :3, 3] = values[usable, :3]
-    return Trajectory(t_ns[usable], T @ T_sensor_body)
+    return Trajectory(t_ns[usable], T @ T_sensor_body, has_rotation)

@@ -1,0 +1,308 @@
+"""Trajectory files of other tools, recognised by their content; what each was taken for is stated.
+
+Read are TUM (ORB-SLAM3 with nanoseconds, evo), EuRoC, VINS-Mono and VINS-Fusion, KITTI, tables whose header names their
+columns, and positions only; separated by blanks, commas or semicolons. What is ambiguous is settled by the numbers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from vislam.core.errors import DataError
+from vislam.core.messages import Array
+from vislam.core.reading import open_file
+from vislam.core.trajectory import Trajectory
+from vislam.trajectory.formats import (
+    data_lines,
+    kitti_poses,
+    read_kitti_times,
+    stamp_ns,
+    trajectory_of_rows,
+    why_columns,
+)
+
+_OTHERS = {
+    b"PK\x03\x04": "a zip archive, as evo saves results; unzip it and give the trajectory in it, if it holds one",
+    b"\x1f\x8b": "packed by gzip; unpack it first",
+    b"version https://git-lfs": "a Git LFS pointer, not the file itself; fetch it: git lfs pull",
+    b"\x93NUMPY": "an array of NumPy; save it as text: t x y z qx qy qz qw",
+    b"\xff\xfe": "UTF-16 or not text; save it as UTF-8",
+    b"#ROSBAG": "a bag; give its topic: --topic or --reference-topic",
+    b"\x89MCAP": "a bag; give its topic: --topic or --reference-topic",
+    b"SQLite format 3": "a database; of a bag give the topic: --topic or --reference-topic",
+}
+_SAMPLE = 100  # rows by which a file is recognised
+_UNITS = {1.0: "nanoseconds", 1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
+_EPOCH = ((1e17, 1.0), (1e14, 1e3), (1e11, 1e6))  # stamps since 1970 from 1973 to 5138 tell their unit
+_NS_STEP = 1e4  # nobody has a pose every three hours, nor every 10 us
+_UNIT_NAMES = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6}
+_UNIT_NAMES |= {"s": 1e9, "sec": 1e9, "secs": 1e9, "seconds": 1e9}
+_TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp"}
+_TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot", "ori", "o"}
+_PLACES = {"p", "pos", "position", "t", "translation", "trans", "location"}
+_RATES = {"v", "vel", "velocity", "twist", "linear", "angular", "b", "bias", "cov", "covariance", "sigma", "std", "acc"}
+_KITTI_HZ = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """A trajectory, what its file was taken for, and whether it has times; without them it is numbered at 10 Hz."""
+
+    trajectory: Trajectory
+    taken_for: str
+    timed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    name: str
+    separator: str | None
+    width: int  # fields of each line, without an empty last one
+    stamp: int | None  # column
+    position: tuple[int, ...] = ()  # columns of x y z
+    quaternion: tuple[int, ...] = ()  # columns of x y z w
+    matrix: int | None = None  # first of 12 columns
+    unit_ns: float = 1e9
+    header: bool = False  # whether the first line is names
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory file of any kind that `recognise` knows. Raises DataError, for one without times too."""
+    found = recognise(path)
+    if not found.timed:
+        raise DataError(f"{path} is {found.taken_for}; put times.txt beside it")
+    return found.trajectory
+
+
+def recognise(path: Path, times: Path | None = None) -> Recognised:
+    """Read a trajectory file by what it holds.
+
+    A file without times (KITTI) takes those of `times`, of times.txt beside it, or where KITTI keeps it.
+
+    Raises:
+        DataError: with file and line, for what is no trajectory, is damaged, or is another kind of file.
+    """
+    _refuse_others(path)
+    layout = _layout(path)
+    stamps, numbers, lines, lost = _rows(path, layout)
+    if not len(numbers):
+        raise DataError(f"{path} holds no poses" + (f", only {lost} rows of NaN" if lost else ""))
+    left_out = f"; {lost} rows of NaN left out" if lost else ""
+    if layout.stamp is None:
+        return _without_stamps(path, times, layout, numbers, lines)
+    if times is not None:
+        raise DataError(f"{path} has times of its own ({layout.name}); leave out the option for {times}")
+    t_ns = np.array([stamp_ns(s, layout.unit_ns, path, n) for s, n in zip(stamps, lines, strict=True)], dtype=np.int64)
+    if layout.matrix is not None:
+        poses = kitti_poses(numbers, path, lines)
+        found = trajectory_of_rows(t_ns, poses, path, lines)
+    else:
+        turns = numbers[:, 3:] if layout.quaternion else np.zeros((len(numbers), 4))
+        found = trajectory_of_rows(t_ns, (numbers[:, :3], turns), path, lines, identity_is_none=True)
+    kind = f"{layout.name}, {_UNITS[layout.unit_ns]}" + ("" if found.has_rotation else ", positions only")
+    return Recognised(found, f"{kind}; {len(found)} poses over {found.duration_s:.1f} s{left_out}")
+
+
+def _without_stamps(path: Path, times: Path | None, layout: _Layout, numbers: Array, lines: list[int]) -> Recognised:
+    sequence = path.parent.parent / "sequences" / path.stem / "times.txt"  # as KITTI's own poses/00.txt
+    beside = next((file for file in (path.with_name("times.txt"), sequence) if file.is_file()), None)
+    poses, chosen = kitti_poses(numbers, path, lines), times or beside
+    if chosen is None:
+        t_ns = np.arange(len(poses)) * (10**9 // _KITTI_HZ)
+        return Recognised(
+            Trajectory(t_ns, poses),
+            f"{layout.name} without times, {len(poses)} poses, taken for 10 a second",
+            timed=False,
+        )
+    t_ns = read_kitti_times(chosen, len(poses), path)
+    given = "given" if times else "found"
+    return Recognised(Trajectory(t_ns, poses), f"{layout.name}, times {given} in {chosen}; {len(poses)} poses")
+
+
+def _refuse_others(path: Path) -> None:
+    try:
+        with open_file(path) as file:
+            head = file.read(32)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    for begin, what in _OTHERS.items():
+        if head.startswith(begin):
+            raise DataError(f"{path} is {what}")
+
+
+def _layout(path: Path) -> _Layout:
+    """Return what the first rows of a file show."""
+    comments: list[str] = []
+    sample = list(islice(data_lines(path, comments), _SAMPLE))
+    if not sample:
+        raise DataError(f"{path} holds no poses")
+    separator = next((sign for sign in (",", ";") if sign in sample[0][1]), None)
+    rows = [_fields(line, separator) for _, line in sample]
+    names = next((n for text in reversed(comments) if len(n := _fields(text, separator)) == len(rows[0])), [])
+    has_header = not any(_is_number(field) for field in rows[0])
+    if has_header:
+        names, rows = rows[0], rows[1:]
+    if not rows:
+        raise DataError(f"{path} holds names of columns, but no poses")
+    width = len(rows[0])
+    if (named := _by_names(names, separator, width, rows)) is not None:
+        stated, stamp, position, quaternion, unit_ns = named
+        return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header)
+    return _by_numbers(path, sample[has_header][0], separator, rows, has_header)
+
+
+def _by_names(
+    names: list[str], separator: str | None, width: int, rows: list[list[str]]
+) -> tuple[str, int, tuple[int, ...], tuple[int, ...], float] | None:
+    """Return kind, columns and unit as a header names them; None where it does not name all that is needed."""
+    if len(names) != width:
+        return None
+    roles = [_role(name) for name in names]
+    position, quaternion = (
+        tuple(roles.index(kind + axis) for axis in axes if kind + axis in roles)
+        for kind, axes in (("p", "xyz"), ("q", "xyzw"))
+    )
+    stamps = [k for k, role in enumerate(roles) if role == "t"]
+    if not stamps or len(position) != 3 or len(quaternion) not in (0, 4):
+        return None
+    stamp = next((k for k in stamps if "stamp" in names[k].lower()), stamps[0])
+    unit = next((_UNIT_NAMES[word] for word in _words(names[stamp])[1:] if word in _UNIT_NAMES), None)
+    table = "TUM" if separator is None and width == 8 and quaternion == (4, 5, 6, 7) else "columns by their names"
+    if separator and (width, quaternion[3:]) in {(8, (4,)), (17, (4,))}:
+        table = "EuRoC"
+    return table, stamp, position, quaternion, _unit_ns(rows, stamp) if unit is None else unit
+
+
+def _role(name: str) -> str:
+    """Return "t", "px" to "pz", "qx" to "qw", or nothing, for what a column holds by its name."""
+    words = _words(re.sub(r"[\[(].*", "", name))
+    if not words:
+        return ""
+    *before, last = words
+    if "stamp" in words or (words[0] in _TIMES and last not in "xyz"):
+        return "t"
+    if _RATES & set(words):
+        return ""
+    if len(last) == 2 and last[1] in "xyzw" and last[0] in "ptqo":  # tx, qw
+        return ("q" if last[0] in "qo" else "p") + last[1]
+    if last == "w" or (last in "xyz" and _TURNS & set(before)):
+        return "q" + last
+    return "p" + last if last in ("x", "y", "z") and (not before or _PLACES & set(before)) else ""
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[a-z]+", name.lower())
+
+
+def _by_numbers(path: Path, line: int, separator: str | None, rows: list[list[str]], header: bool) -> _Layout:
+    """Return what rows without names hold, by how many numbers there are and what they are."""
+    width, kind = len(rows[0]), "separated by blanks" if separator is None else f"separated by '{separator}'"
+    try:
+        first = np.array([float(field) for field in rows[0]])
+    except ValueError as error:
+        raise DataError(f"{path}:{line}: {error}; no row of numbers, and no names of columns before it") from error
+    if width == 12 and _is_pose(first):
+        return _Layout("KITTI", separator, width, None, matrix=0, header=header)
+    if width == 16 and _is_pose(first[:12]):
+        return _Layout("4x4 matrices", separator, width, None, matrix=0, header=header)
+    unit_ns = _unit_ns(rows, 0)
+    if width in (13, 17) and _is_pose(first[1:13]):
+        return _Layout("stamp and matrix", separator, width, 0, matrix=1, unit_ns=unit_ns, header=header)
+    if width == 4:
+        return _Layout(f"stamp and position {kind}", separator, width, 0, (1, 2, 3), (), None, unit_ns, header)
+    if width < 8 or not _has_quaternion(rows):
+        raise DataError(f"{path}:{line}: {why_columns(width)}")
+    w_first = separator is not None and (unit_ns != 1e9 or width == 17 or abs(first[4]) > 0.99)
+    if separator is None:
+        name = "TUM" if unit_ns == 1e9 else "TUM columns as of ORB-SLAM3"
+    else:
+        known = {8: "EuRoC", 17: "EuRoC", 11: "VINS-Mono or VINS-Fusion"}
+        name = known.get(width, f"a table {kind}") if w_first else f"TUM columns {kind}"
+    name += ", quaternion w first" if w_first else ", quaternion w last"
+    if separator is None and width > 8:
+        name += f", {width - 8} further columns ignored"
+    return _Layout(
+        name, separator, width, 0, (1, 2, 3), (5, 6, 7, 4) if w_first else (4, 5, 6, 7), None, unit_ns, header
+    )
+
+
+def _has_quaternion(rows: list[list[str]]) -> bool:
+    """Return whether columns 5 to 8 of most rows have norm 1, or are zero or NaN as where no rotation is given."""
+    turns = np.array([[float(f) if _is_number(f) else np.inf for f in row[4:8]] for row in rows if len(row) >= 8])
+    norms = np.linalg.norm(turns, axis=1)
+    return bool(np.mean((np.abs(norms - 1.0) < 0.1) | (norms == 0.0) | np.isnan(norms)) > 0.5)
+
+
+def _is_pose(twelve: Array) -> bool:
+    R = twelve.reshape(3, 4)[:, :3]
+    return bool(np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < 0.05 and np.linalg.det(R) > 0.0)
+
+
+def _unit_ns(rows: list[list[str]], column: int) -> float:
+    """Return the unit of stamps by how large they are and how far apart."""
+    stamps = np.array([float(row[column]) for row in rows if len(row) > column and _is_number(row[column])])
+    stamps = stamps[np.isfinite(stamps)]
+    if not len(stamps):
+        return 1e9
+    largest = float(np.abs(stamps).max())
+    for least, unit_ns in _EPOCH:
+        if largest >= least:
+            return unit_ns
+    steps = np.abs(np.diff(stamps))
+    return 1.0 if len(steps) and np.median(steps) >= _NS_STEP else 1e9
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return "_" not in field
+
+
+def _fields(line: str, separator: str | None) -> list[str]:
+    """Return the fields of a line, without an empty one behind the last separator."""
+    fields = [field.strip() for field in line.split(separator)]
+    return fields[:-1] if separator is not None and fields and not fields[-1] else fields
+
+
+def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int]:
+    """Return stamps, the numbers of poses [N, 3, 7 or 12], lines [N], and how many rows had NaN in the place of all."""
+    used: Sequence[int] = (*layout.position, *layout.quaternion)
+    if layout.matrix is not None:
+        used = range(layout.matrix, layout.matrix + 12)
+    stamps: list[str] = []
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    skip = layout.header
+    for number, line in data_lines(path):
+        if skip:
+            skip = False
+            continue
+        fields = _fields(line, layout.separator)
+        if len(fields) != layout.width:
+            raise DataError(f"{path}:{number}: {len(fields)} columns, where the first row has {layout.width}")
+        try:
+            if "_" in line and any("_" in fields[k] for k in used):  # Python would read 1_0 as ten
+                raise ValueError("'_' is not part of a number")
+            rows.append([float(fields[k]) for k in used])
+        except ValueError as error:
+            raise DataError(f"{path}:{number}: {error}") from error
+        stamps.append("" if layout.stamp is None else fields[layout.stamp])
+        lines.append(number)
+    numbers = np.array(rows).reshape(-1, len(used))
+    if layout.quaternion and np.isnan(numbers[:, 3:]).all():
+        numbers[:, 3:] = 0.0
+    kept = ~np.isnan(numbers).all(axis=1) if layout.stamp is not None else np.ones(len(numbers), dtype=bool)
+    index = np.flatnonzero(kept)
+    stamps, lines, numbers = [stamps[k] for k in index], [lines[k] for k in index], numbers[kept]
+    finite = np.isfinite(numbers).all(axis=1)
+    if not finite.all():
+        raise DataError(f"{path}:{lines[int(np.argmin(finite))]}: NaN or infinity; remove or repair the line")
+    return stamps, numbers, lines, int(len(kept) - len(index))
