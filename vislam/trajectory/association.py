@@ -77,8 +77,9 @@ def associate(
         limit_s = max(_NEAREST_S, 0.5 * min(intervals_s)) if max_gap_s is None else max_gap_s
         at_reference = len(reference) < len(estimate)
         lead, other = (reference, estimate) if at_reference else (estimate, reference)
-        t_ns, *poses = _nearest(lead, other, limit_s)
-        return Pairs(t_ns, *(poses[::-1] if at_reference else poses), len(lead), limit_s, at_reference, has_rotation)
+        t_ns, own, others = _nearest(lead, other, limit_s)
+        poses = (others, own) if at_reference else (own, others)
+        return Pairs(t_ns, *poses, len(lead), limit_s, at_reference, has_rotation)
     limit_s = max(_GAP_S, 2.0 * intervals_s[1]) if max_gap_s is None else max_gap_s
     at_reference = intervals_s[1] > max(_GAP_S, _SLOWER * intervals_s[0])
     asked, total = (_next_to(estimate, reference), len(reference)) if at_reference else (estimate, len(estimate))

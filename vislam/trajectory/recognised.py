@@ -150,7 +150,7 @@ def _layout(path: Path) -> _Layout:
         names, rows = rows[0], rows[1:]
     if not rows:
         raise DataError(f"{path} holds names of columns, but no poses")
-    width = len(rows[0])
+    width = len(names if has_header else rows[0])
     if (named := _by_names(names, separator, width, rows)) is not None:
         stated, stamp, position, quaternion, unit_ns = named
         return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header)
@@ -287,7 +287,8 @@ def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int
             continue
         fields = _fields(line, layout.separator)
         if len(fields) != layout.width:
-            raise DataError(f"{path}:{number}: {len(fields)} columns, where the first row has {layout.width}")
+            first = "header" if layout.header else "first row"
+            raise DataError(f"{path}:{number}: {len(fields)} columns, where the {first} has {layout.width}")
         try:
             if "_" in line and any("_" in fields[k] for k in used):  # Python would read 1_0 as ten
                 raise ValueError("'_' is not part of a number")
@@ -297,9 +298,9 @@ def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int
         stamps.append("" if layout.stamp is None else fields[layout.stamp])
         lines.append(number)
     numbers = np.array(rows).reshape(-1, len(used))
+    kept = ~np.isnan(numbers).all(axis=1) if layout.stamp is not None else np.ones(len(numbers), dtype=bool)
     if layout.quaternion and np.isnan(numbers[:, 3:]).all():
         numbers[:, 3:] = 0.0
-    kept = ~np.isnan(numbers).all(axis=1) if layout.stamp is not None else np.ones(len(numbers), dtype=bool)
     index = np.flatnonzero(kept)
     stamps, lines, numbers = [stamps[k] for k in index], [lines[k] for k in index], numbers[kept]
     finite = np.isfinite(numbers).all(axis=1)

@@ -31,7 +31,7 @@ class EvalOptions:
     reference: Path | None = None
     """True trajectory, as the estimate; a run folder brings its own"""
     topic: str = ""
-    """Of a bag: Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped, PointStamped or Path; default: its only"""
+    """Of a bag: topic of poses (Odometry, PoseStamped, TransformStamped, Path, ...); default: its only one"""
     reference_topic: str = ""
     """Of a bag as --reference"""
     times: Path | None = None

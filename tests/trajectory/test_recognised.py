@@ -1,0 +1,259 @@
+"""Files of trajectories as other tools write them: what they are taken for, and their numbers."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.core import metrics, sync
+from evo.tools import file_interface
+from scipy.spatial.transform import Rotation
+
+from vislam.cli import run_verb
+from vislam.core.errors import DataError
+from vislam.trajectory import (
+    Trajectory,
+    associate,
+    coverage,
+    evaluate,
+    read_trajectory,
+    read_tum,
+    recognise,
+    write_kitti,
+    write_tum,
+)
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def path_of(count: int = 100, period_ns: int = 50_000_000, start_ns: int = START_NS) -> Trajectory:
+    t = np.arange(count) * period_ns * 1e-9
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZY", np.stack([0.3 * t + 0.4, 0.2 * np.sin(t)], 1)).as_matrix()
+    poses[:, :3, 3] = np.stack([3 * np.cos(0.3 * t), 3 * np.sin(0.3 * t), 0.1 * t], 1)
+    return Trajectory(start_ns + np.arange(count) * period_ns, poses)
+
+
+PATH = path_of()
+ROWS = [
+    (int(t), *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
+    for t, T in zip(PATH.t_ns, PATH.T_world_body, strict=True)
+]
+
+
+def tum(t: int, *v: float, separator: str = " ", unit: str = "s") -> str:
+    stamp = {"s": f"{t // 10**9}.{t % 10**9:09d}", "ns": f"{t}.000000", "e": f"{t // 10**6}e-3"}[unit]
+    return separator.join([stamp, *map(repr, map(float, v))])
+
+
+def w_first(t: int, *v: float, rest: str = "", separator: str = ",") -> str:
+    return separator.join([str(t), *(repr(float(x)) for x in (*v[:3], v[6], *v[3:6]))]) + rest
+
+
+def w_first_seconds(t: int, *v: float) -> str:
+    return w_first(t, *v).replace(str(t), f"{t // 10**9}.{t % 10**9:09d}", 1)
+
+
+def text(row: Callable[..., str], head: str = "", end: str = "\n") -> str:
+    return head + end.join(row(*r) for r in ROWS) + end
+
+
+ZEROS = ",0.1,0,0,"
+FORMS = {
+    "orbslam3": (text(lambda *r: tum(*r, unit="ns")), "ORB-SLAM3"),
+    "scientific": (text(lambda *r: tum(*r, unit="e")), "TUM"),
+    "mark of order, CRLF": ("\ufeff" + text(tum, "# timestamp tx ty tz qx qy qz qw\r\n", "\r\n"), "TUM"),
+    "tabs": (text(lambda *r: tum(*r, separator="\t")), "TUM"),
+    "commas": (text(lambda *r: tum(*r, separator=",")), "w last"),
+    "semicolons": (text(lambda *r: tum(*r, separator=";")), "w last"),
+    "a further column": (text(lambda *r: tum(*r) + " 7"), "1 further columns"),
+    "vins": (text(lambda *r: w_first(*r, rest=ZEROS)), "VINS"),
+    "vins loop": (text(lambda *r: w_first(*r, rest=",")), "w first"),
+    "euroc": (text(lambda *r: w_first(*r, rest=",0" * 9)), "EuRoC"),
+    "named": (text(w_first_seconds, "time,x,y,z,qw,qx,qy,qz\n"), "EuRoC, seconds"),
+    "okvis": (
+        text(
+            lambda *r: tum(*r, separator=", ", unit="ns") + ", 1, 2, 3",
+            "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_W_x, v_W_y, v_W_z\n",
+        ),
+        "by their names",
+    ),
+    "rostopic": (
+        text(
+            lambda *r: f"{r[0]},3,{r[0]},odom," + tum(*r, separator=",").partition(",")[2],
+            "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.pose.position.x,"
+            "field.pose.position.y,field.pose.position.z,field.pose.orientation.x,field.pose.orientation.y,"
+            "field.pose.orientation.z,field.pose.orientation.w\n",
+        ),
+        "by their names",
+    ),
+    "stamp and matrix": (
+        "".join(
+            f"{t} " + " ".join(map(repr, T[:3].ravel().tolist())) + "\n"
+            for t, T in zip(PATH.t_ns, PATH.T_world_body, strict=True)
+        ),
+        "stamp and matrix",
+    ),
+    "a row of NaN": (text(tum) + f"{START_NS // 10**9 + 60} nan nan nan nan nan nan nan\n", "1 rows of NaN left out"),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_each_form_gives_the_same_path_and_states_what_it_is(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "poses"
+    path.write_text(FORMS[name][0], encoding="utf-8", newline="")
+    found = recognise(path)
+    assert FORMS[name][1] in found.taken_for
+    assert found.trajectory.t_ns.tolist() == PATH.t_ns.tolist()
+    np.testing.assert_allclose(found.trajectory.T_world_body, PATH.T_world_body, atol=1e-9)
+
+
+def test_stamps_that_count_from_zero_are_nanoseconds_by_their_steps(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("".join(w_first(t - START_NS, *v) + "\n" for t, *v in ROWS))
+    assert read_trajectory(path).t_ns.tolist() == (PATH.t_ns - START_NS).tolist()
+    path.write_text("".join(tum(t - START_NS, *v) + "\n" for t, *v in ROWS))
+    assert read_trajectory(path).t_ns.tolist() == (PATH.t_ns - START_NS).tolist()
+
+
+def test_kitti_takes_times_beside_it_or_given_and_two_without_are_paired_by_rows(tmp_path: Path, capsys) -> None:
+    for name in ("a.txt", "b.txt"):
+        write_kitti(PATH, tmp_path / name)
+    asked = ["eval", str(tmp_path / "a.txt"), "--reference"]
+    assert run_verb([*asked, str(tmp_path / "b.txt")]) == 0
+    assert "without times, 100 poses, taken for 10 a second" in capsys.readouterr().out
+    write_tum(PATH, tmp_path / "true.tum")
+    assert run_verb([*asked, str(tmp_path / "true.tum")]) == 3
+    assert "--times FILE" in capsys.readouterr().err
+    with pytest.raises(DataError, match=r"put times\.txt beside it"):
+        read_trajectory(tmp_path / "a.txt")
+    times = tmp_path / "stamps.txt"
+    times.write_text("".join(f"{t * 1e-9:.3f}\n" for t in PATH.t_ns))
+    assert run_verb([*asked, str(tmp_path / "true.tum"), "--times", str(times)]) == 0
+    times.rename(tmp_path / "times.txt")
+    assert read_trajectory(tmp_path / "a.txt").t_ns[3] == PATH.t_ns[3]
+
+
+def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
+    noise = np.random.default_rng(2).normal(0, 0.03, (100, 3))
+    noisy = PATH.T_world_body.copy()
+    noisy[:, :3, 3] += noise
+    pair = {"truth": PATH, "estimate": Trajectory(PATH.t_ns + 4_000_000, noisy)}
+    theirs = {}
+    for name, trajectory in pair.items():
+        write_tum(trajectory, tmp_path / name)
+        theirs[name] = file_interface.read_tum_trajectory_file(str(tmp_path / name))
+        file_interface.write_tum_trajectory_file(str(tmp_path / name), theirs[name])
+    ours = evaluate(read_trajectory(tmp_path / "estimate"), read_trajectory(tmp_path / "truth"), association="nearest")
+    truth, estimate = sync.associate_trajectories(theirs["truth"], theirs["estimate"], max_diff=0.025)
+    estimate.align(truth)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((truth, estimate))
+    assert ours["matched"] == truth.num_poses == 100
+    assert ours["ate_rmse_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"PK\x03\x04rest", "zip archive, as evo saves results"),
+        (b"\x1f\x8b\x08", "gzip"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        (b"\xff\xfet\x00", "UTF-16"),
+        (b"1 2 3\n", "3 numbers in which no pose is found"),
+        (b"1 2 3 4 5 6 7\n", "put the time before each"),
+        (b"1 2 3 4 5 6 7 8 9 10 11 12\n", "12 numbers, a 3x4 matrix"),
+        (b"1 2 3 4 5 6 7 8 9 10 11 12 13\n", "13 numbers"),
+        (b"1 0 0 0 0 0 0 1\n2 0 0 0 0 0\n", "poses:2: 6 columns, where the first row has 8"),
+        (b"time,x,y,z\n", "no poses"),
+        (b"a,b,c\nd,e,f\n", "could not convert"),
+        (b"1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", "poses:2: NaN"),
+        (b"1 nan nan nan nan nan nan nan\n", "only 1 rows of NaN"),
+        (b"2 0 0 0 0 0 .6 .8\n1 0 0 0 0 0 .6 .8\n", "sort the file"),
+        (b"timestamp,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0\n", "poses:2: 7 columns, where the header has 8"),
+    ],
+)
+def test_what_is_no_trajectory_is_named_for_what_it_is(data: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "poses"
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=message):
+        recognise(path)
+
+
+@pytest.mark.parametrize("turn", ["", " 0 0 0 0", " 0 0 0 1", " 1 0 0 0", " nan nan nan nan"])
+def test_positions_only_give_no_rotation_and_no_relative_errors(turn: str, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "gps.txt"
+    path.write_text("".join(f"{t * 1e-9:.2f} {x!r} {y!r} {z!r}{turn}\n" for t, x, y, z, *_ in to_floats(ROWS)))
+    truth = read_trajectory(path)
+    assert not truth.has_rotation
+    entry = evaluate(PATH, truth)
+    assert entry["ate_rmse_m"] < 1e-6
+    assert [entry[key] for key in ("rotation_rmse_deg", "rpe_1s_m", "rpe_1s_deg")] == [None] * 3
+    assert {values["m"] for values in entry["rpe_segments"].values()} == {None}
+    write_tum(truth, tmp_path / "again.tum")  # as a run does
+    assert not read_tum(tmp_path / "again.tum").has_rotation
+    write_tum(PATH, tmp_path / "estimate.tum")
+    assert run_verb(["eval", str(tmp_path / "estimate.tum"), "--reference", str(path)]) == 0
+    assert "positions only" in capsys.readouterr().out
+    assert run_verb(["eval", str(tmp_path / "estimate.tum"), "--reference", str(path), "--align", "first"]) == 2
+
+
+def to_floats(rows: list) -> list:
+    return [tuple(float(x) if k else x for k, x in enumerate(row)) for row in rows]
+
+
+def test_a_slow_truth_is_compared_next_to_its_own_poses() -> None:
+    noise = np.random.default_rng(4).normal(0, 0.02, (600, 3))
+    fine = path_of(600, 100_000_000)
+    noisy = fine.T_world_body.copy()
+    noisy[:, :3, 3] += noise
+    estimate = Trajectory(fine.t_ns, noisy)
+    slow = path_of(60, 1_000_000_000)
+    entry = evaluate(estimate, slow)
+    assert (entry["matched"], entry["total"], entry["coverage"]) == (60, 60, 1.0)
+    assert entry["at"] == "reference"
+    assert entry["ate_rmse_m"] == pytest.approx(0.02 * np.sqrt(3), rel=0.15)
+    assert len(associate(estimate, slow, max_gap_s=0.5)) == 60  # of equal stamps
+    shifted = Trajectory(slow.t_ns + 30_000_000, slow.T_world_body)
+    assert len(associate(estimate, shifted)) == 60
+    with pytest.raises(DataError, match=r"every 0\.1 s, the reference every 1 s, and 0\.5 s apart is the limit"):
+        evaluate(estimate, shifted, max_gap_s=0.5)
+    assert len(associate(estimate, shifted, "nearest")) == 60
+    assert len(associate(estimate, shifted, "nearest", 0.01)) == 0
+
+
+@pytest.mark.parametrize("period_s", [0.005, 1.0, 2.0, 60.0])
+def test_a_trajectory_covers_itself(period_s: float) -> None:
+    one = path_of(50, round(period_s * 1e9))
+    assert coverage(one, one) == 1.0
+    holed = Trajectory(np.delete(one.t_ns, np.s_[10:40]), np.delete(one.T_world_body, np.s_[10:40], axis=0))
+    assert coverage(holed, holed) == 1.0
+    assert coverage(holed, one) == (1.0 if period_s < 0.03 else pytest.approx(18 / 49))
+    assert evaluate(one, one)["matched"] == 50
+
+
+def test_the_table_states_what_was_done_in_80_columns(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    names = [tmp_path / name for name in ("a_rather_long_name_of_a_camera_trajectory_that_somebody_chose.txt", "truth")]
+    for path in names:
+        write_tum(path_of(20_000), path)
+    assert run_verb(["eval", str(names[0]), "--reference", str(names[1])]) == 0
+    out = capsys.readouterr().out
+    assert "estimate: a_rather" in out and "TUM" in out
+    table = out[out.index("┏") :]
+    assert max(map(len, table.splitlines())) <= 80
+    assert "…" not in out and "20000/20000" in out
+    for words in ("SE(3), scale kept", "Metres and degrees", "interpolated at the estimate's times", "0.1 s"):
+        assert words in " ".join(table.split())
+
+
+def test_clocks_are_doubted_only_where_the_spans_do_not_overlap(tmp_path: Path, capsys) -> None:
+    early = Trajectory(PATH.t_ns - START_NS, PATH.T_world_body)
+    with pytest.raises(DataError, match=r"spans 0\.00 to 4\.95 s, the reference 1700000000\.00 .* same clock\?"):
+        evaluate(early, PATH)
+    write_tum(PATH, tmp_path / "truth.tum")
+    write_tum(Trajectory(PATH.t_ns[:30], PATH.T_world_body[:30]), tmp_path / "begin.tum")
+    assert run_verb(["eval", str(tmp_path / "begin.tum"), "--reference", str(tmp_path / "truth.tum")]) == 4
+    error = capsys.readouterr().err
+    assert "begin.tum covers 29% of the reference's time, 80% asked" in error
+    assert "spans 1700000000.00 to 1700000001.45 s" in error and "clock" not in error
