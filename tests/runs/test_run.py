@@ -20,7 +20,7 @@ from vislam.runs.folder import prepare
 from vislam.runs.report.run_files import read_run
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
-from vislam.trajectory import Trajectory, evaluate, read_tum
+from vislam.trajectory import Trajectory, evaluate, read_tum, write_tum
 from worlds.shared import shared
 
 REPLAYED = ("trajectory_ekf.tum", "trajectory_live.tum", "trajectory_graph.tum", "loops.csv", "states_graph.csv")
@@ -309,6 +309,26 @@ def test_an_interrupt_keeps_what_was_computed(small_room, tmp_path):
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["frames"] > 40
     assert "stopped early" in metrics["warnings"][0]
+
+
+def test_evaluation_of_a_run_equals_its_report(finished, tmp_path, capsys):
+    out = shutil.copytree(finished, tmp_path / "run")
+    truth, report = read_tum(out / "trajectory_truth.tum"), json.loads((out / "metrics.json").read_text())["accuracy"]
+    longer = np.append(truth.t_ns, truth.t_ns[-1] + np.arange(1, 400) * 50_000_000)  # a truth that goes on
+    poses = np.concatenate([truth.T_world_body, np.tile(truth.T_world_body[-1], (399, 1, 1))])
+    for wanted in (truth, Trajectory(longer, poses)):
+        write_tum(wanted, out / "trajectory_truth.tum")
+        capsys.readouterr()
+        assert run_verb(["eval", str(out), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found.keys() == report.keys()
+        for name, entry in report.items():
+            assert found[name]["alignment"] == entry["alignment"] == "yaw"
+            for key in ("ate_rmse_m", "rotation_rmse_deg", "rpe_1s_m", "rpe_1s_deg", "scale", "coverage"):
+                assert found[name][key] == pytest.approx(entry[key], rel=1e-5, abs=1e-6), (name, key)
+    assert run_verb(["eval", str(out), "--align", "se3"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "aligned by SE(3)" in said and "aligned as asked" in said
 
 
 def test_evaluation_fails_on_too_little_coverage(finished, tmp_path, capsys):
