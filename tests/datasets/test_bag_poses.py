@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vislam.cli import run_verb
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.datasets.bags import trajectory_of_topic
 from worlds.bag_writer import Message, Types, types_of, write_bag
 

@@ -10,7 +10,7 @@ from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
 from vislam.cli import run_verb
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.trajectory import (
     Trajectory,
     associate,

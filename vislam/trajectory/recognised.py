@@ -39,8 +39,8 @@ _OTHERS = {
 }
 _SAMPLE = 100  # rows by which a file is recognised
 _UNITS = {1.0: "nanoseconds", 1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
-_EPOCH = ((1e17, 1.0), (1e14, 1e3), (1e11, 1e6))  # stamps since 1970 from 1973 to 5138 tell their unit
-_NS_STEP = 1e4  # nobody has a pose every three hours, nor every 10 us
+_EPOCH = ((1e17, 1.0), (1e14, 1e3), (1e11, 1e6))  # stamps since 1970 from 1973 to 5138 show their unit
+_NS_STEP = 1e4  # poses are neither three hours apart nor 10 us
 _UNIT_NAMES = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6}
 _UNIT_NAMES |= {"s": 1e9, "sec": 1e9, "secs": 1e9, "seconds": 1e9}
 _TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp"}
