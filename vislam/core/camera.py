@@ -28,6 +28,7 @@ _MODEL_CODES = {"none": 0, "radtan": 1, "equidistant": 2, "rational": 3}
 _COEFFICIENT_COUNTS = {"none": (0,), "radtan": (4, 5), "equidistant": (4,), "rational": (8,)}
 _MAX_NEWTON_STEPS = 20
 _MIN_Z_M = 1e-6
+_LEAST_BASELINE_M = 1e-4  # less is what poses of one place differ by when they are inverted and multiplied
 _NO_COEFFICIENT = 1e-12  # of a polynomial in r^2: what it changes at any radius that a lens sees is no pixel's part
 
 
@@ -328,6 +329,15 @@ class Rig:
     def T_cam0_cam1(self) -> Array:
         """Pose [4, 4] of the second camera in the first."""
         return invert(self.T_body_cams[0]) @ self.T_body_cams[1]
+
+    def check_baseline(self) -> None:
+        """Raise DataError where the first two cameras sit at one place: such a pair measures no depth."""
+        if self.is_stereo and np.linalg.norm(self.T_cam0_cam1[:3, 3]) < _LEAST_BASELINE_M:
+            raise DataError(
+                "cam0 and cam1 sit at the same place, by which they see no depth; state where both are (T_BS of each "
+                "sensor.yaml, /tf_static of a bag, or --calibration.camera FILE with T_cam_imu), or use one: "
+                "--frontend.mode mono"
+            )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -295,11 +295,17 @@ class _Inspector:
         rig = self._found.rig
         if rig is None or frames is None or not len(frames.t_ns):
             return
-        try:
-            if rig.is_stereo:
+        if rig.is_stereo:
+            with self._as_finding():
                 self._judge_stereo(self._stereo_facts(rig, frames))
-            if facts is not None:
+        if facts is not None:
+            with self._as_finding():
                 self._judge_extrinsics(rig, frames, facts)
+
+    @contextmanager
+    def _as_finding(self) -> Iterator[None]:
+        try:
+            yield
         except DataError as error:
             self._add("error", str(error), str(self._found.root))
 

@@ -129,7 +129,11 @@ class EpipolarFacts:
 
 
 def epipolar_facts(rig: Rig, pairs: Iterable[tuple[ImageU8, ImageU8]]) -> EpipolarFacts:
-    """Match ORB features between the cameras and compare with the epipolar geometry of the rig."""
+    """Match ORB features between the cameras and compare with the epipolar geometry of the rig.
+
+    Raises DataError where both cameras sit at one place.
+    """
+    rig.check_baseline()
     T_cam1_cam0 = invert(rig.T_cam0_cam1)
     R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
     E = skew(t) @ R

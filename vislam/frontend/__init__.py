@@ -39,16 +39,18 @@ def mode_for(config: FrontEndConfig, rig: Rig) -> Mode:
     """Return the name of the front end that a configuration means.
 
     `auto` takes the richest that the rig allows; one camera whose height above a floor is known is `planar`. Raises
-    UsageError where one is to look through a camera that there is not.
+    UsageError where one is to look through a camera that there is not, DataError for a pair of cameras at one place.
     """
     if rig.is_blind:
         if config.mode not in ("auto", "none"):
             raise UsageError(f"--frontend.mode {config.mode} needs a camera, and the recording has none; leave it away")
         return "none"
-    if config.mode != "auto":
-        return config.mode
     one_camera: Mode = "mono" if config.planar.height_m is None else "planar"
-    return "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
+    richest: Mode = "rgbd" if rig.has_depth else "stereo" if rig.is_stereo else one_camera
+    mode = richest if config.mode == "auto" else config.mode
+    if mode == "stereo":
+        rig.check_baseline()
+    return mode
 
 
 def common_errors(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
