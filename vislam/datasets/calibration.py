@@ -6,8 +6,11 @@ docs/formats.md lists every key. Poses are `T_BS`: the sensor's pose in the body
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import logging
+import re
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +19,14 @@ import yaml
 
 from vislam.core.camera import Camera, CameraSigmas, Distortion
 from vislam.core.errors import DataError
-from vislam.core.geometry import are_rotations, invert
+from vislam.core.geometry import are_rotations
 from vislam.core.messages import Array
 from vislam.core.reading import read_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.tables import check_size
 from vislam.imu import ImuNoise
 
+_LOG = logging.getLogger(__name__)
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
 _MAX_YAML_BYTES = 2**18
 _MOST_OFFSET_PX = 1000.0  # more is no camera's: a file that was damaged
@@ -43,6 +47,59 @@ CAMERA_EXAMPLE = (
     "T_BS: {rows: 4, cols: 4, data: [16 numbers]}, resolution: [640, 480], intrinsics: [fx, fy, cx, cy], "
     "distortion_model: radial-tangential, distortion_coefficients: [k1, k2, p1, p2]"
 )
+_SILENT = frozenset({  # keys that say nothing that an estimate could miss, or that other readers of the file ask for
+    "sensor_type", "comment", "rostopic", "cam_overlaps", "camera_name", "camera_id", "rate_hz", "update_rate",
+    "registered_to", "rectification_matrix", "projection_matrix", "depth_units_per_m", "depth_invalid",
+    "depth_offset_px", "depth_time_offset_s", "gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix",
+})  # fmt: skip
+# a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale
+_WEIGHTY = re.compile(r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|time_?(shift|offset)|^td$|scale", re.A)
+_MOST_NAMED = 12
+
+
+class Keys(dict[str, Any]):
+    """The mapping of a calibration file, which knows what was asked of it.
+
+    Attributes:
+        asked: keys that a reader looked at, whether they are there or not.
+    """
+
+    def __init__(self, data: Mapping[str, Any]) -> None:
+        """Take a mapping over."""
+        super().__init__(data)
+        self.asked: set[str] = set()
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return what a key holds, or the default."""
+        self.asked.add(key)
+        return super().get(key, default)
+
+    def __getitem__(self, key: str) -> Any:
+        self.asked.add(key)
+        return super().__getitem__(key)
+
+    def name_unused(self, path: Path, instead: str = "", known: Collection[str] = ()) -> None:
+        """Warn of keys that nothing was asked for.
+
+        Args:
+            path: the file.
+            instead: keys of poses that are read; where given, a pose, clock or scale that was not used is refused.
+            known: further keys that need no word.
+
+        Raises:
+            DataError: a key was not used without which an estimate would be wrong.
+        """
+        needless = self.asked | _SILENT | set(known)
+        rest = {str(key): value for key, value in self.items() if key not in needless and value is not None}
+        # an identity is a pose, too: where none is read, the recording's own stands
+        weighty = [k for k, v in rest.items() if instead and _WEIGHTY.search(k) and (isinstance(v, list | dict) or v)]
+        if weighty:
+            raise DataError(
+                f"{path}: the meaning of {_listed(weighty)} is not known, and without it the camera would be at the "
+                f"wrong place or time; write {instead}, or remove it"
+            )
+        if unused := [key for key, value in rest.items() if not _says_nothing(value)]:
+            _warn_once(f"{path}: not used: {_listed(unused)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,38 +147,28 @@ def load_yaml(path: Path) -> dict[str, Any]:
 
 def read_camera(path: Path) -> CameraFile:
     """Return the camera of an ASL sensor file; raises DataError naming the key, what was got and what is wanted."""
-    data = load_yaml(path)
+    data = Keys(load_yaml(path))
     try:
-        return CameraFile(
+        found = CameraFile(
             camera=parse_camera(data, path, "distortion_coefficients"),
             T_body_cam=read_pose(data, path),
             rate_hz=optional_positive(data, "rate_hz", path),
             depth=parse_depth(data, path),
         )
+        data.name_unused(path, "T_BS")
+        return found
     except DataError as error:
         raise DataError(f"{error}; a camera's file holds: {CAMERA_EXAMPLE}") from error
 
 
 def read_imu(path: Path) -> tuple[ImuNoise, Array]:
     """Return noise and pose `T_BS` [4, 4] of an ASL IMU file; raises DataError naming the key."""
-    data = load_yaml(path)
+    data = Keys(load_yaml(path))
     # `vislam calibrate noise` writes Kalibr's key, and its file is put in the place of this one
     key = "update_rate" if "update_rate" in data and "rate_hz" not in data else "rate_hz"
-    return parse_noise(data, key, path), read_pose(data, path)
-
-
-def read_camchain(path: Path, index: int) -> CameraFile:
-    """Return camera `index` of a Kalibr camera chain; its body frame is the IMU (`T_cam_imu`). Raises DataError."""
-    data = load_yaml(path).get(f"cam{index}")
-    if not isinstance(data, dict):
-        raise DataError(f"{path} has no cam{index}")
-    T_cam_imu = np.array(numbers_in(data, "T_cam_imu", path, 16)).reshape(4, 4)
-    return CameraFile(parse_camera(data, path, "distortion_coeffs"), invert(T_cam_imu))
-
-
-def read_imu_config(path: Path) -> ImuNoise:
-    """Return the noise in a Kalibr IMU file; raises DataError naming the key."""
-    return parse_noise(load_yaml(path), "update_rate", path)
+    noise, T_body_imu = parse_noise(data, key, path), read_pose(data, path)
+    data.name_unused(path, "T_BS")
+    return noise, T_body_imu
 
 
 def read_pose(data: Mapping[str, Any], path: Path) -> Array:
@@ -211,8 +258,7 @@ def optional_positive(data: Mapping[str, Any], key: str, path: Path, allow_zero:
 def numbers_in(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
     """Return a list (nested lists are joined) of finite numbers; YAML reads 5e-6 as text, so text is converted."""
     value = data.get(key)
-    rows = value if isinstance(value, list) else [value]
-    flat: list[Any] = [x for row in rows for x in (row if isinstance(row, list) else [row])]
+    flat = _flat(value)
     try:
         numbers = [float(x) for x in flat]
     except (TypeError, ValueError, OverflowError):
@@ -270,3 +316,29 @@ def depth_keys_text(how: DepthFormat) -> str:
 def list_text(values: Iterable[float]) -> str:
     """Return numbers as a YAML list that reads back to the same bits."""
     return "[" + ", ".join(repr(float(value)) for value in values) + "]"
+
+
+def _says_nothing(value: Any) -> bool:
+    """Return whether a value is none, zero, one or an identity: not to use it changes nothing."""
+    try:
+        flat = np.array(_flat(value["data"] if isinstance(value, dict) else value), dtype=np.float64)
+    except (TypeError, ValueError, KeyError, OverflowError):
+        return value is None
+    side = round(np.sqrt(flat.size))
+    return not flat.any() or (flat.size == side**2 and np.array_equal(flat, np.eye(side).ravel()))
+
+
+def _flat(value: Any) -> list[Any]:
+    """Return the elements of a list, and of lists in it."""
+    rows = value if isinstance(value, list) else [value]
+    return [x for row in rows for x in (row if isinstance(row, list) else [row])]
+
+
+def _listed(keys: list[str]) -> str:
+    more = f" and {len(keys) - _MOST_NAMED} more" if len(keys) > _MOST_NAMED else ""
+    return ", ".join(key[:40] for key in keys[:_MOST_NAMED]) + more
+
+
+@lru_cache(maxsize=256)  # a file is read several times on the way to a run
+def _warn_once(text: str) -> None:
+    _LOG.warning("%s", text)

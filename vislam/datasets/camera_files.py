@@ -1,4 +1,4 @@
-"""Camera calibrations in the files of others: Kalibr's camchain.yaml, ROS's camera_info, ASL's sensor.yaml.
+"""Camera calibrations in the files of others: chains of Kalibr and OpenVINS, ROS's camera_info, ASL's sensor.yaml.
 
 A Kalibr chain of cameras alone has no `T_cam_imu`; ROS files have no pose at all. What a file does not say is None.
 """
@@ -16,7 +16,7 @@ from vislam.core.camera import Camera, Distortion
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
-from vislam.datasets.calibration import SIGMA_KEYS, list_text, load_yaml, numbers_in, parse_camera, read_pose
+from vislam.datasets.calibration import SIGMA_KEYS, Keys, list_text, load_yaml, numbers_in, parse_camera, read_pose
 
 _MAX_CAMERAS = 2
 _RATIONAL = "rational_polynomial"
@@ -41,24 +41,49 @@ class CameraCalibration:
 
 
 def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
-    """Return the calibration of one camera, or of the first two of a Kalibr chain; raises DataError naming the key."""
-    data = load_yaml(path)
+    """Return the calibration of one camera, or of the first two of a Kalibr chain.
+
+    Raises DataError naming the key; also for a pose, clock or scale that is not understood. Other keys that are not
+    used are warned of.
+    """
+    data = Keys(load_yaml(path))
     if "camera_matrix" in data:
-        return (CameraCalibration(_ros_camera(data, path)),)
-    if not isinstance(data.get("cam0"), dict):
+        found = (CameraCalibration(_ros_camera(data, path)),)
+    elif not isinstance(data.get("cam0"), dict):
         pose = read_pose(data, path) if data.get("T_BS") is not None else None
-        return (CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose),)
-    chain = [data[name] for k in range(_MAX_CAMERAS) if isinstance(data.get(name := f"cam{k}"), dict)]
+        found = (CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose),)
+    else:
+        return _chain(data, path)
+    data.name_unused(path, "T_BS")
+    return found
+
+
+def _chain(data: Keys, path: Path) -> tuple[CameraCalibration, ...]:
     found: list[CameraCalibration] = []
-    for entry in chain:
+    names = [name for k in range(_MAX_CAMERAS) if isinstance(data.get(name := f"cam{k}"), dict)]
+    for name in names:
+        entry = Keys(data[name])
         camera = parse_camera(entry, path, "distortion_coeffs")
-        T_body_cam = _optional_pose(entry, "T_cam_imu", path)
-        T_cam_before = _optional_pose(entry, "T_cn_cnm1", path)
+        T_body_cam, T_cam_before = _place(entry, path), _optional_pose(entry, "T_cn_cnm1", path)
         if T_body_cam is None and found and T_cam_before is not None:
             before = found[-1].T_body_cam
-            T_body_cam = None if before is None else before @ T_cam_before
+            T_body_cam = None if before is None else before @ invert(T_cam_before)
         found.append(CameraCalibration(camera, T_body_cam, *_offset(entry, path)))
+        entry.name_unused(path, "T_cam_imu and timeshift_cam_imu")
+    data.name_unused(path, "T_cam_imu in each camera's block")
     return tuple(found)
+
+
+def _place(entry: Keys, path: Path) -> Array | None:
+    """Return the pose [4, 4] of a chain's camera in the body: Kalibr writes its inverse, OpenVINS the pose itself."""
+    T_cam_body, T_body_cam = (_optional_pose(entry, key, path) for key in ("T_cam_imu", "T_imu_cam"))
+    if (
+        T_cam_body is not None
+        and T_body_cam is not None
+        and not np.allclose(T_cam_body @ T_body_cam, np.eye(4), 0, 1e-3)
+    ):
+        raise DataError(f"{path}: T_cam_imu and T_imu_cam are not inverse to each other; remove the wrong one")
+    return T_body_cam if T_cam_body is None else invert(T_cam_body)
 
 
 def camchain_text(cameras: Sequence[CameraCalibration], comment: str) -> str:
@@ -112,13 +137,13 @@ def _offset(entry: Mapping[str, Any], path: Path) -> tuple[float | None, float |
 
 
 def _optional_pose(entry: Mapping[str, Any], key: str, path: Path) -> Array | None:
-    """Return the inverse of a transform [4, 4] in a chain, None where there is none."""
+    """Return a transform [4, 4] of a chain, None where there is none."""
     if entry.get(key) is None:
         return None
     T = np.array(numbers_in(entry, key, path, 16)).reshape(4, 4)
     if not are_rotations(T[:3, :3], _RIGID):
         raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
-    return invert(T)
+    return T
 
 
 def _ros_camera(data: Mapping[str, Any], path: Path) -> Camera:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.calibration import list_text, load_yaml, numbers_in, parse_noise
+from vislam.datasets.calibration import NOISE_KEYS, Keys, list_text, load_yaml, numbers_in, parse_noise
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 Calibration = TypeVar("Calibration", ImuCalibration, MagCalibration)
@@ -38,9 +38,22 @@ def imu_noise_text(noise: ImuNoise, comment: str) -> str:
 
 
 def read_noise(path: Path) -> ImuNoise:
-    """Return the noise model of Kalibr's imu.yaml or of an ASL sensor.yaml; raises DataError naming the key."""
-    data = load_yaml(path)
-    return parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
+    """Return the noise model of Kalibr's imu.yaml or its results, of OpenVINS's IMU chain or of an ASL sensor.yaml.
+
+    What the file states of the IMU beside its noise (T_i_b, time_offset, Tw) is warned of where it means anything.
+    Raises DataError naming the key.
+    """
+    data = Keys(load_yaml(path))
+    nested = [str(key) for key, value in data.items() if isinstance(value, dict) and set(NOISE_KEYS) & set(value)]
+    if len(nested) > 1:
+        one = ", ".join(nested)
+        raise DataError(f"{path} holds {len(nested)} IMUs: {one}; give a file with the block of the recording's alone")
+    if nested:
+        data.name_unused(path, known=nested)
+        data = Keys(data[nested[0]])
+    noise = parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
+    data.name_unused(path, known=("model",))
+    return noise
 
 
 def imu_calibration_text(calibration: ImuCalibration, comment: str) -> str:

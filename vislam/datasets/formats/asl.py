@@ -17,9 +17,10 @@ from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets import calibration as files
 from vislam.datasets.calibration import CAMERA_EXAMPLE, DEPTH_UNITS_PER_M, CameraFile
+from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.formats.truth import Truth, asl_truth
 from vislam.datasets.images import DepthFormat, ImageList
-from vislam.datasets.imu_files import imu_calibration, mag_calibration
+from vislam.datasets.imu_files import imu_calibration, mag_calibration, read_noise
 from vislam.datasets.stream import Survey, image_list, with_depth_format
 from vislam.datasets.tables import read_names
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -86,7 +87,7 @@ def _imu(root: Path, errors: list[DataError]) -> tuple[Path | None, ImuNoise | N
         kalibr = _kalibr(root, "imu_config.yaml")
         if kalibr is None:
             raise DataError(f"{sensor} is missing; write the IMU's noise into it, see docs/formats.md")
-        return data, files.read_imu_config(kalibr), np.eye(4), None
+        return data, read_noise(kalibr), np.eye(4), None
     except DataError as error:
         errors.append(error)
         return data, None, np.eye(4), None
@@ -126,7 +127,10 @@ def _camera_file(root: Path, index: int) -> CameraFile:
     kalibr = _kalibr(root, "camchain.yaml")
     if kalibr is None:
         raise DataError(f"{sensor} is missing; write the calibration into it: {CAMERA_EXAMPLE}")
-    return files.read_camchain(kalibr, index)
+    chain = read_cameras(kalibr)
+    if index >= len(chain) or chain[index].T_body_cam is None:
+        raise DataError(f"{kalibr} has no cam{index} with T_cam_imu; add it, or write {sensor}: {CAMERA_EXAMPLE}")
+    return CameraFile(chain[index].camera, np.asarray(chain[index].T_body_cam))
 
 
 def _kalibr(root: Path, name: str) -> Path | None:
