@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -121,6 +123,48 @@ def test_kalibrs_relative_poses_are_followed() -> None:
     assert found[1].T_body_cam == pytest.approx(T_body_cam0 @ np.linalg.inv(T_cam1_cam0))
 
 
+def chain_of(*pairs: tuple[str, np.ndarray], more: str = "") -> str:
+    """A chain with one pose a camera, under any name."""
+    text = camchain_text([CameraCalibration(CAMERA, np.eye(4)) for _ in pairs], "")
+    blocks = re.split(r"^(?=cam\d:)", text, flags=re.MULTILINE)[1:]
+    for k, (name, T) in enumerate(pairs):
+        rows = "".join(f"  - {row}\n" for row in T.tolist())
+        blocks[k] = re.sub(r"  T_cam_imu:\n(  - .*\n){4}", f"  {name}:\n{rows}{more}", blocks[k])
+    return "%YAML:1.0\n" + "".join(blocks)
+
+
+def test_openvins_writes_the_pose_that_kalibr_inverts() -> None:
+    T0, T1 = (se3_exp(np.array(xi)) for xi in ([0.1, 0.2, 0.3, 1.0, 2.0, 3.0], [-0.3, 0.1, 0.2, 0.4, 0.5, 0.6]))
+    theirs = read_cameras(written(chain_of(("T_imu_cam", T0), ("T_imu_cam", T1))))
+    kalibr = read_cameras(written(chain_of(("T_cam_imu", np.linalg.inv(T0)), ("T_cam_imu", np.linalg.inv(T1)))))
+    for one, other, T in zip(theirs, kalibr, (T0, T1), strict=True):
+        assert one.T_body_cam == pytest.approx(T) and other.T_body_cam == pytest.approx(T)
+    both = chain_of(("T_imu_cam", T0)) + "".join(f"{r}\n" for r in ["  T_cam_imu:", *(f"  - {r}" for r in T0.tolist())])
+    with pytest.raises(DataError, match="not inverse"):
+        read_cameras(written(both))
+
+
+@pytest.mark.parametrize("key", ["T_cam_body", "body_T_cam0", "T_i_c", "T_BC", "Tbc", "timeshift_imu_cam", "scale"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda key: chain_of((key, se3_exp(np.full(6, 0.1)))),
+        lambda key: chain_of(("T_cam_imu", np.eye(4)), more=f"  {key}: 0.25\n"),
+        lambda key: camera_text(CAMERA, None, "") + f"{key}: [0.5]\n",
+    ],
+)
+def test_a_pose_clock_or_scale_that_is_not_known_is_refused_by_name(make: Callable[[str], str], key: str) -> None:
+    path = written(make(key))
+    with pytest.raises(DataError, match=rf"{path}: the meaning of {key} is not known.*write T_"):
+        read_cameras(path)
+
+
+def test_other_keys_that_are_not_used_are_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    path = written(chain_of(("T_cam_imu", np.eye(4)), more="  vignette: [3.0]\n  gamma: 0.0\n"))
+    assert read_cameras(path)[0].camera == read_cameras(path)[0].camera == CAMERA
+    assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: vignette"]
+
+
 RATIONAL = camera_info_text(replace(CAMERA, coefficients=(-0.1, 0.01, 1e-4, 2e-4, 0.5)), "c")
 RATIONAL = RATIONAL.replace("plumb_bob", "rational_polynomial").replace("0.5]", "0.5, 0.1, 0.1, 0.1, 0.1]")
 
@@ -168,6 +212,20 @@ def test_partial_or_singular_imu_files_are_refused(text: str) -> None:
 def test_noise_reads_back() -> None:
     assert read_noise(written(imu_noise_text(NOISE, "x"))) == NOISE
     assert read_noise(written(imu_text(NOISE, "x"))) == NOISE
+
+
+def test_kalibrs_results_of_imus_are_read_and_what_is_not_used_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    block = imu_noise_text(NOISE, "").replace("\n", "\n  ").rstrip(" ")
+    still = (
+        "  T_i_b: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n  time_offset: 0.0\n  model: calibrated\n"
+    )
+    assert read_noise(written(f"imu0:\n  {block}{still}")) == NOISE
+    assert not caplog.records
+    path = written(f"imu0:\n  {block}  Tw: [[1, 0, 0], [0, 1.1, 0], [0, 0, 1]]\n  time_offset: 0.01\n")
+    assert read_noise(path) == NOISE
+    assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: Tw, time_offset"]
+    with pytest.raises(DataError, match="holds 2 IMUs: imu0, imu1; give"):
+        read_noise(written(f"imu0:\n  {block}imu1:\n  {block}"))
 
 
 def raw_recording(folder: Path, sensor_extra: str = "") -> Path:

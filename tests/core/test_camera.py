@@ -188,6 +188,8 @@ def test_rectified_points_share_a_row_and_disparity_gives_depth():
         rectify(Rig((EUROC,), (np.eye(4),)))
     with pytest.raises(DataError, match="swap the cameras"):
         rectify(Rig((EUROC, SKEWED), (left_pose @ offset, left_pose)))
+    with pytest.raises(DataError, match="same place"):
+        rectify(Rig((EUROC, SKEWED), (left_pose, left_pose @ transform(offset[:3, :3], np.zeros(3)))))
 
 
 @pytest.mark.parametrize("margin_px", [0.0, 5.0])

@@ -13,13 +13,14 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from vislam.cli import run_verb
-from vislam.config import CalibrationConfig
+from vislam.config import CalibrationConfig, FrontEndConfig
 from vislam.core import Problems
 from vislam.core.errors import DataError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.inspect import inspect
+from vislam.frontend import mode_for
 from worlds.bag_writer import KINDS, Message, Types, from_asl, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, HEIGHT, IMU_YAML, WIDTH, picture, write_asl
 
@@ -389,6 +390,56 @@ def test_the_field_is_in_microtesla_and_in_the_axes_of_the_body(tmp_path: Path, 
     fields = [event.field_ut for event in events if isinstance(event, MagSample)]
     assert len(fields) == 40
     assert np.allclose(fields[0], [0.0, 20.0, -40.0])
+
+
+@pytest.mark.parametrize("options", ["", ",imu=/accel", ",imu=/gyro"])
+def test_rates_and_forces_on_two_topics_are_joined_in_the_axes_of_the_rates(
+    options: str, tmp_path: Path, noise: CalibrationConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    types = types_of("mcap")
+    T = np.eye(4)
+    T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    static = types.transforms(0, [("gyro", "accel", T), ("gyro", "cam0", np.eye(4))])
+    messages = [*images_of(types), Message(0, "/tf_static", static)]
+    for i in range(41):
+        t_ns = BEGIN_NS + i * 5_000_000
+        messages.append(Message(t_ns, "/gyro", types.imu(t_ns, [0.1 * i, 0.2, 0.3, 0, 0, 0], "gyro")))
+    for i in range(11):
+        t_ns = BEGIN_NS + i * 20_000_000
+        messages.append(Message(t_ns, "/accel", types.imu(t_ns, [0, 0, 0, 4.0 * i, 1.0, 9.8], "accel")))
+    path = write_bag(tmp_path, "mcap", messages)
+    samples = [e for e in open_dataset(f"bag:{path}{options}", noise).events() if isinstance(e, ImuSample)]
+    assert [s.t_ns for s in samples] == [BEGIN_NS + i * 5_000_000 for i in range(41)]
+    assert np.allclose([s.gyro_rad_s for s in samples], [[0.1 * i, 0.2, 0.3] for i in range(41)])
+    assert np.allclose([s.accel_m_s2 for s in samples], [[-1.0, i, 9.8] for i in range(41)])
+    assert "rates of /gyro with the forces of /accel" in caplog.text
+    roles = {topic.name: topic.taken_for for topic in survey(f"bag:{path}{options}").topics}
+    assert (roles["/gyro"], roles["/accel"]) == ("rates of imu0", "forces of imu0")
+
+
+def test_a_gyroscope_alone_is_no_imu(tmp_path: Path, noise: CalibrationConfig) -> None:
+    types = types_of("mcap")
+    rates = [Message(t, "/gyro", types.imu(t, [0.1, 0, 0, 0, 0, 0], "cam0")) for t in range(BEGIN_NS, BEGIN_NS + 40, 2)]
+    path = write_bag(tmp_path, "mcap", [*images_of(types), *rates])
+    with pytest.raises(DataError, match=r"forces are all zero.*imu=none"):
+        open_dataset(str(path), noise)
+
+
+def test_cameras_that_transforms_put_at_one_place_are_named(tmp_path: Path) -> None:
+    types = types_of("mcap")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array([0.1, -0.4, 0.3]))[0], [0.3, -0.2, 1.7]
+    messages = [Message(0, "/tf_static", types.transforms(0, [("base", "cam0", T), ("base", "cam1", T)]))]
+    for i in range(3):
+        t_ns = BEGIN_NS + i * FRAME_NS
+        for k in range(2):
+            messages.append(Message(t_ns, f"/cam{k}/image_raw", types.image(t_ns, picture(i), "mono8", f"cam{k}")))
+    infos = [types.info(BEGIN_NS, SIZE, K, "plumb_bob", [0.0] * 5, f"cam{k}") for k in range(2)]
+    messages += [Message(BEGIN_NS, f"/cam{k}/camera_info", info) for k, info in enumerate(infos)]
+    path = write_bag(tmp_path, "mcap", messages)
+    with pytest.raises(DataError, match=r"cam0 and cam1 sit at the same place.*/tf_static"):
+        mode_for(FrontEndConfig(), open_dataset(str(path)).rig)
+    assert any("same place" in f.what and f.severity == "error" for f in inspect(str(path)).findings)
 
 
 def test_truth_is_read_only_where_it_is_told(tmp_path: Path) -> None:

@@ -368,6 +368,7 @@ def rectify(rig: Rig, scale: float = 1.0) -> StereoRectification:
     """
     if not rig.is_stereo:
         raise DataError("stereo rectification needs two cameras, the rig has one")
+    rig.check_baseline()
     T_cam1_cam0 = invert(rig.T_cam0_cam1)
     first, second = rig.cameras[0].scaled(scale), rig.cameras[1].scaled(scale)
     size = (first.width, first.height)

@@ -73,6 +73,7 @@ class Choice:
     infos: tuple[Entry | None, ...]  # of each camera
     depth: ImageFacts | None
     imu: Entry | None
+    forces: Entry | None  # of the IMU, where its own topic has rates alone
     mag: Entry | None
     truth: Entry | None
 
@@ -82,7 +83,9 @@ class Choice:
         taken |= {info.topic.name: f"calibration of cam{k}" for k, info in enumerate(self.infos) if info is not None}
         if self.depth is not None:
             taken[self.depth.name] = "depth0"
-        for role, entry in (("imu0", self.imu), ("mag0", self.mag), ("truth", self.truth)):
+        rates = "imu0" if self.forces is None else "rates of imu0"
+        samples = ((rates, self.imu), ("forces of imu0", self.forces), ("mag0", self.mag), ("truth", self.truth))
+        for role, entry in samples:
             if entry is not None:
                 taken[entry.topic.name] = role
         return taken
@@ -107,12 +110,12 @@ def chosen(listing: Listing, options: BagOptions) -> Choice:
         _entry(listing, f"info{k}", given, (CAMERA_INFO,), _info(listing, camera, len(cameras)))
         for k, (camera, given) in enumerate(zip(cameras, (options.info0, options.info1), strict=False))
     )
-    imus, mags = listing.of_type(IMU), listing.of_type(MAGNETIC)
+    mags = listing.of_type(MAGNETIC)
     return Choice(
         cameras,
         infos,
         depth if cam0 is not None else None,
-        _entry(listing, "imu", options.imu, (IMU,), max(imus, key=_imu_rank, default=None)),
+        *_imu(listing, options.imu),
         _entry(listing, "mag", options.mag, (MAGNETIC,), max(mags, key=lambda entry: entry.count, default=None)),
         _entry(listing, "truth", options.truth, TRUTHS, None),
     )
@@ -219,6 +222,29 @@ def _info(listing: Listing, camera: ImageFacts, cameras: int) -> Entry | None:
         if (found := next((info for info in infos if info.topic.name == name), None)) is not None:
             return found
     return infos[0] if len(infos) == 1 and cameras == 1 else None
+
+
+def _imu(listing: Listing, given: str | None) -> tuple[Entry | None, Entry | None]:
+    """Return the topic of an IMU, and that of its forces where rates and forces are apart, as RealSense has them."""
+    imus = sorted(listing.of_type(IMU), key=_imu_rank, reverse=True)
+    measured = {entry.topic.name: _measured(listing, entry) for entry in imus}
+    best = sorted(imus, key=lambda entry: not all(measured[entry.topic.name]))  # those of one rank keep their order
+    taken = _entry(listing, "imu", given, (IMU,), best[0] if best else None)
+    if taken is None or all(measured[taken.topic.name]):
+        return taken, None
+    rates = next((entry for entry in imus if measured[entry.topic.name] == (True, False)), None)
+    forces = next((entry for entry in imus if measured[entry.topic.name] == (False, True)), None)
+    if rates is None or forces is None:
+        return taken, None
+    return (taken, forces) if measured[taken.topic.name][0] else (rates, taken)
+
+
+def _measured(listing: Listing, entry: Entry) -> tuple[bool, bool]:
+    """Return whether the first messages of a topic hold rates and forces; what is not measured is zero."""
+    first = list(listing.first_messages(entry))
+    triples = [[getattr(m, name) for m in first] for name in ("angular_velocity", "linear_acceleration")]
+    rates, forces = (any(v.x != 0.0 or v.y != 0.0 or v.z != 0.0 for v in values) for values in triples)
+    return rates, forces
 
 
 def _imu_rank(entry: Entry) -> tuple[bool, float, int]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
-from vislam.core.messages import ImageF32, ImageU8
+from vislam.core.messages import Array, ImageF32, ImageU8
 from vislam.core.recording import Problems
 from vislam.datasets.bags import pictures
 from vislam.datasets.bags.bag import Bag
@@ -22,8 +22,9 @@ from vislam.datasets.bags.decoding import decoded
 from vislam.datasets.bags.listing import fitting, stamp
 from vislam.datasets.bags.stored import HEAD_BYTES, DamagedError, Found, Place, Topic
 from vislam.datasets.images import UnreadableImageError
+from vislam.datasets.imu_pairs import paired
 from vislam.datasets.loaders import FrameTable, LoadedImages
-from vislam.datasets.tables import Row
+from vislam.datasets.tables import Row, in_time_order
 
 _ENOUGH = 20  # messages, and most of them unusable, settle it
 _UT_PER_TESLA = 1e6
@@ -50,11 +51,17 @@ class BagStreams:
         depth: ImageTopic | None,
         samples: tuple[Topic | None, Topic | None],
         by_log_time: bool,
+        forces: tuple[Topic, Array] | None = None,
     ) -> None:
-        """Take the topics of images, of inertial samples and of the field."""
+        """Take the topics of images, of inertial samples and of the field.
+
+        `forces` is the topic of an accelerometer that is apart, and its rotation [3, 3] in the body; then those of the
+        inertial samples are rates alone.
+        """
         self._bag = bag
         self._cameras, self._depth = tuple(cameras), depth
         self._imu, self._mag = samples
+        self._forces = forces
         self._by_log_time = by_log_time
 
     @property
@@ -69,9 +76,19 @@ class BagStreams:
 
     def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         """Yield stamp, rates and forces as they were stored; raises DataError when most cannot be used."""
-        return (
-            iter(()) if self._imu is None else topic_rows(self._bag, self._imu, _inertial, self._by_log_time, problems)
-        )
+        if self._imu is None:
+            return iter(())
+        if self._forces is None:
+            return topic_rows(self._bag, self._imu, _inertial, self._by_log_time, problems)
+        topic, R_body_forces = self._forces
+
+        def turned(message: Any) -> list[float]:
+            return (R_body_forces @ _inertial(message)[3:]).tolist()
+
+        rates = topic_rows(self._bag, self._imu, lambda message: _inertial(message)[:3], self._by_log_time, problems)
+        forces = topic_rows(self._bag, topic, turned, self._by_log_time, problems)
+        ordered = (in_time_order(rows, problems, of) for rows, of in ((rates, self._imu.name), (forces, topic.name)))
+        return paired(next(ordered), next(ordered), problems, self._bag.path.name)
 
     def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         """Yield stamp and field in µT; as `imu_rows`."""

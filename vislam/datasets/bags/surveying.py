@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,7 @@ from vislam.datasets.bags.decoding import (
     why_unreadable,
 )
 from vislam.datasets.bags.listing import Entry, Listing, fitting
+from vislam.datasets.bags.stored import Topic
 from vislam.datasets.bags.streams import BagStreams, ImageTopic, messages_of
 from vislam.datasets.bags.transforms import Frames, rigid
 from vislam.datasets.calibrated import joined_rig
@@ -35,12 +37,13 @@ from vislam.datasets.camera_files import ros_camera
 from vislam.datasets.formats.truth import Truth, trajectory_of
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_files import read_noise
-from vislam.datasets.plausibility import imu_facts, unit_doubt
+from vislam.datasets.plausibility import imu_facts, mean_force, unit_doubt
 from vislam.datasets.stream import FRAME_HOLE_S, KnownCamera, Survey, TopicSummary
 from vislam.datasets.tables import Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
 
+_LOG = logging.getLogger(__name__)
 _LOOKED_AT_NS = 20_000_000_000  # of the inertial samples, to see whether their units can be
 _CALIBRATION = "--calibration.camera FILE"
 _NOISE = "--calibration.imu-noise FILE"
@@ -79,10 +82,12 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
     images = [_images(facts, f"cam{k}", found.problems) for k, facts in enumerate(choice.cameras)]
     depth = None if choice.depth is None else _images(choice.depth, "depth0", found.problems)
     by_log_time = options.stamps == "log"
+    body = _frame_id(listing, choice.imu) or (choice.cameras[0].frame if choice.cameras else "")
     samples = tuple(None if entry is None else entry.topic for entry in (choice.imu, choice.mag))
     streams = BagStreams(
-        bag, [topic for _, topic in images], None if depth is None else depth[1], (samples[0], samples[1]), by_log_time
-    )
+        bag, [topic for _, topic in images], None if depth is None else depth[1], (samples[0], samples[1]), by_log_time,
+        _forces(listing, choice, frames, body),
+    )  # fmt: skip
     has_others = any("Image" in entry.topic.type for entry in listing.entries.values()) and options.cam0 != NONE
     if not images and (choice.imu is None or has_others):
         go_on = "" if choice.imu is None else "; cam0=none runs without them"
@@ -91,7 +96,6 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
     if choice.imu is not None:
         noise = _noise(path, choice.imu, found)
         _check_imu(streams, [listed for listed, _ in images], path, found)
-    body = _frame_id(listing, choice.imu) or (choice.cameras[0].frame if choice.cameras else "")
     known = _known_cameras(listing, choice, frames, body, found)
     rig = joined_rig(known, has_depth=depth is not None)
     mag_frame = _frame_id(listing, choice.mag)
@@ -114,6 +118,19 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         problems=found.problems,
         errors=tuple(found.errors),
     )
+
+
+def _forces(listing: Listing, choice: Choice, frames: Frames, body: str) -> tuple[Topic, Array] | None:
+    """Return the topic of an accelerometer that is apart from its gyroscope, and its rotation [3, 3] in the body."""
+    if choice.forces is None or choice.imu is None:
+        return None
+    T_body_forces = frames.between(body, _frame_id(listing, choice.forces))
+    _LOG.warning(
+        "imu0 is the rates of %s with the forces of %s, interpolated at their stamps%s",
+        choice.imu.topic.name, choice.forces.topic.name,
+        "" if T_body_forces is not None else "; no transform between their frames: taken as of the same axes",
+    )  # fmt: skip
+    return choice.forces.topic, np.eye(3) if T_body_forces is None else T_body_forces[:3, :3]
 
 
 def _noise(path: Path, imu: Entry, found: _Found) -> ImuNoise | None:
@@ -261,10 +278,16 @@ def _check_imu(streams: BagStreams, images: list[ImageList], path: Path, found: 
             yield row
 
     try:
-        doubt = unit_doubt(imu_facts(some()))
+        facts = imu_facts(some())
+        doubt = unit_doubt(facts)
     except DataError as error:
         found.errors.append(error)
         return
+    if doubt is None and len(facts.window_t_ns) and mean_force(facts)[0] == 0.0:
+        doubt = (
+            "its forces are all zero",
+            "record the accelerometer in its topic, too (RealSense: unite_imu_method:=2)",
+        )
     if doubt is not None:
         found.errors.append(DataError(f"{path}: imu0: {doubt[0]}; {doubt[1]}, or leave it out: imu=none"))
     for listed in images[:1]:
