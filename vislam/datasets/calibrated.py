@@ -12,9 +12,11 @@ import numpy as np
 from vislam.config import CalibrationConfig, Config
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.core.messages import Array
 from vislam.core.recording import Problems
-from vislam.datasets.calibration import DepthFile, load_yaml, parse_depth
-from vislam.datasets.camera_files import read_cameras
+from vislam.datasets.calibration import DepthFile, parse_depth
+from vislam.datasets.camera_files import CameraCalibration, read_cameras
+from vislam.datasets.foreign_cameras import load_keys
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.stream import KnownCamera, Survey, with_depth_format
 
@@ -86,7 +88,7 @@ def with_clock(config: Config) -> Config:
 
 def _with_depth(found: Survey, path: Path) -> Survey:
     """Return what a recording holds, with its depth read as the camera's file states, if it does."""
-    said = parse_depth(load_yaml(path), path)
+    said = parse_depth(load_keys(path), path)
     if said == DepthFile() or found.depth is None:
         return found
     if found.streams is not None:
@@ -106,7 +108,7 @@ def _completed_rig(found: Survey, path: Path) -> Rig:
             f"{path} has {len(cameras)} camera, the recording has {len(found.known_cameras)}; calibrate both"
         )
     pairs = list(zip(cameras, found.known_cameras, strict=False))
-    T_ins = [old.T_body_cam if new.T_body_cam is None else np.asarray(new.T_body_cam) for new, old in pairs]
+    T_ins = _placed(cameras, [old.T_body_cam for old in found.known_cameras])
     joined = [KnownCamera(new.camera, T) for (new, _), T in zip(pairs, T_ins, strict=True)]
     rig = joined_rig(joined, found.depth is not None)
     if rig is None:
@@ -126,8 +128,16 @@ def _rig(recorded: Rig, path: Path) -> Rig:
                 f"{path}: cam{index} is for {new.camera.width}x{new.camera.height}, "
                 f"the recording has {old.width}x{old.height}; calibrate at the size that is recorded"
             )
-    poses = tuple(
-        old if new.T_body_cam is None else np.asarray(new.T_body_cam)
-        for new, old in zip(found, recorded.T_body_cams, strict=True)
-    )
-    return Rig(tuple(new.camera for new in found), poses, recorded.has_depth)
+    poses = [T for T in _placed(found, recorded.T_body_cams) if T is not None]
+    return Rig(tuple(new.camera for new in found), tuple(poses), recorded.has_depth)
+
+
+def _placed(cameras: Sequence[CameraCalibration], recorded: Sequence[Array | None]) -> list[Array | None]:
+    """Return where cameras are: as their file states, by the body or by the camera before, else as recorded."""
+    found: list[Array | None] = []
+    for new, old in zip(cameras, recorded, strict=False):
+        T = new.T_body_cam
+        if T is None and new.T_before_cam is not None and found and found[-1] is not None:
+            T = found[-1] @ new.T_before_cam
+        found.append(old if T is None else np.asarray(T))
+    return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -28,7 +28,7 @@ from vislam.imu import ImuNoise
 
 _LOG = logging.getLogger(__name__)
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
-_MAX_YAML_BYTES = 2**18
+MAX_YAML_BYTES = 2**18
 _MOST_OFFSET_PX = 1000.0  # more is no camera's: a file that was damaged
 _MOST_TIME_OFFSET_S = 10.0
 MODELS: dict[str, Distortion] = {
@@ -53,7 +53,7 @@ _SILENT = frozenset({  # keys that say nothing that an estimate could miss, or t
     "depth_offset_px", "depth_time_offset_s", "gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix",
 })  # fmt: skip
 # a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale
-_WEIGHTY = re.compile(r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|time_?(shift|offset)|^td$|scale", re.A)
+WEIGHTY = re.compile(r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|time_?(shift|offset)|^td$|scale", re.A)
 _MOST_NAMED = 12
 
 
@@ -78,7 +78,7 @@ class Keys(dict[str, Any]):
         self.asked.add(key)
         return super().__getitem__(key)
 
-    def name_unused(self, path: Path, instead: str = "", known: Collection[str] = ()) -> None:
+    def name_unused(self, path: Path, instead: str = "", known: Iterable[str] = ()) -> None:
         """Warn of keys that nothing was asked for.
 
         Args:
@@ -92,7 +92,7 @@ class Keys(dict[str, Any]):
         needless = self.asked | _SILENT | set(known)
         rest = {str(key): value for key, value in self.items() if key not in needless and value is not None}
         # an identity is a pose, too: where none is read, the recording's own stands
-        weighty = [k for k, v in rest.items() if instead and _WEIGHTY.search(k) and (isinstance(v, list | dict) or v)]
+        weighty = [k for k, v in rest.items() if instead and WEIGHTY.search(k) and (isinstance(v, list | dict) or v)]
         if weighty:
             raise DataError(
                 f"{path}: the meaning of {_listed(weighty)} is not known, and without it the camera would be at the "
@@ -132,10 +132,12 @@ def load_yaml(path: Path) -> dict[str, Any]:
 
     Raises DataError when it is missing, too large, no YAML, or no mapping.
     """
-    check_size(path, _MAX_YAML_BYTES)
+    check_size(path, MAX_YAML_BYTES)
     try:
-        text = read_text(path, _MAX_YAML_BYTES)
+        text = read_text(path, MAX_YAML_BYTES)
         lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
+        if len(lines) < len(text.splitlines()):  # OpenCV wants no space behind a colon
+            lines = [re.sub(r"^(\s*[A-Za-z_][\w.]*):(?=[\w\[\"+-])", r"\1: ", line) for line in lines]
         data = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]

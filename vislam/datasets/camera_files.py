@@ -16,7 +16,8 @@ from vislam.core.camera import Camera, Distortion
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
-from vislam.datasets.calibration import SIGMA_KEYS, Keys, list_text, load_yaml, numbers_in, parse_camera, read_pose
+from vislam.datasets.calibration import SIGMA_KEYS, Keys, list_text, numbers_in, parse_camera, read_pose
+from vislam.datasets.foreign_cameras import foreign_cameras, load_keys
 
 _MAX_CAMERAS = 2
 _RATIONAL = "rational_polynomial"
@@ -38,24 +39,30 @@ class CameraCalibration:
     T_body_cam: Array | None = None  # [4, 4], body is the IMU
     time_offset_s: float | None = None  # to be added to the camera's stamps to get the IMU's time
     time_offset_sigma_s: float | None = None
+    T_before_cam: Array | None = None  # [4, 4], in the camera before it
 
 
 def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
-    """Return the calibration of one camera, or of the first two of a Kalibr chain.
+    """Return the calibration of the first two cameras at most in a file of any program that docs/formats.md lists.
 
     Raises DataError naming the key; also for a pose, clock or scale that is not understood. Other keys that are not
     used are warned of.
     """
-    data = Keys(load_yaml(path))
-    if "camera_matrix" in data:
-        found = (CameraCalibration(_ros_camera(data, path)),)
-    elif not isinstance(data.get("cam0"), dict):
-        pose = read_pose(data, path) if data.get("T_BS") is not None else None
-        found = (CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose),)
-    else:
+    data = load_keys(path)
+    if isinstance(data.get("cam0"), dict):
         return _chain(data, path)
+    if (foreign := foreign_cameras(data, path)) is not None:
+        return tuple(
+            CameraCalibration(one.camera, one.T_body_cam, one.time_offset_s, T_before_cam=one.T_before_cam)
+            for one in foreign
+        )
+    if not {"intrinsics", "resolution"} & set(data):
+        held = ", ".join(str(key)[:40] for key in list(data)[:8])
+        raise DataError(f"{path} holds {held}: no camera calibration that is known; see docs/formats.md")
+    pose = read_pose(data, path) if data.get("T_BS") is not None else None
+    found = CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose)
     data.name_unused(path, "T_BS")
-    return found
+    return (found,)
 
 
 def _chain(data: Keys, path: Path) -> tuple[CameraCalibration, ...]:
@@ -65,12 +72,13 @@ def _chain(data: Keys, path: Path) -> tuple[CameraCalibration, ...]:
         entry = Keys(data[name])
         camera = parse_camera(entry, path, "distortion_coeffs")
         T_body_cam, T_cam_before = _place(entry, path), _optional_pose(entry, "T_cn_cnm1", path)
-        if T_body_cam is None and found and T_cam_before is not None:
+        T_before_cam = None if T_cam_before is None else invert(T_cam_before)
+        if T_body_cam is None and found and T_before_cam is not None:
             before = found[-1].T_body_cam
-            T_body_cam = None if before is None else before @ invert(T_cam_before)
-        found.append(CameraCalibration(camera, T_body_cam, *_offset(entry, path)))
+            T_body_cam = None if before is None else before @ T_before_cam
+        found.append(CameraCalibration(camera, T_body_cam, *_offset(entry, path), T_before_cam))
         entry.name_unused(path, "T_cam_imu and timeshift_cam_imu")
-    data.name_unused(path, "T_cam_imu in each camera's block")
+    data.name_unused(path, "T_cam_imu in each camera's block", known=(f"cam{k}" for k in range(len(names), 16)))
     return tuple(found)
 
 
@@ -144,51 +152,6 @@ def _optional_pose(entry: Mapping[str, Any], key: str, path: Path) -> Array | No
     if not are_rotations(T[:3, :3], _RIGID):
         raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
     return T
-
-
-def _ros_camera(data: Mapping[str, Any], path: Path) -> Camera:
-    K = np.array(_ros_numbers(data, "camera_matrix", path, 9)).reshape(3, 3)
-    sizes = {key: [data.get(key)] for key in ("image_width", "image_height")}
-    width, height = (int(numbers_in(sizes, key, path, 1)[0]) for key in sizes)
-    name = str(data.get("distortion_model", "plumb_bob"))
-    coefficients = _ros_numbers(data, "distortion_coefficients", path)
-    return ros_camera((width, height), K, name, coefficients, str(path))
-
-
-def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list[float], where: str) -> Camera:
-    """Return the camera that ROS describes by K [3, 3], its distortion's name and coefficients.
-
-    Raises DataError for a lens that vislam does not have.
-    """
-    width, height = size_px
-    if name in ("equidistant", "fisheye", "kannala_brandt") and len(coefficients) >= 4 and not any(coefficients[4:]):
-        model: Distortion = "equidistant"
-        coefficients = coefficients[:4]
-    elif name in ("plumb_bob", _RATIONAL, "none", "") and not any(coefficients):
-        model = "none"
-    elif name in ("plumb_bob", _RATIONAL) and not any(coefficients[5:]):
-        model = "radtan"
-        coefficients = coefficients[: 5 if len(coefficients) > 4 and coefficients[4] != 0.0 else 4]
-    elif name == _RATIONAL and not any(coefficients[8:]):  # thin prisms and tilted sensors are behind the eighth
-        model = "rational"
-        coefficients = (coefficients + [0.0] * 8)[:8]
-    else:
-        raise DataError(
-            f"{where}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob, "
-            f"{_RATIONAL} with 8, or equidistant with 4"
-        )
-    try:
-        return Camera(
-            width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model,
-            () if model == "none" else tuple(coefficients),
-        )  # fmt: skip
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
-
-
-def _ros_numbers(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
-    holder = data.get(key)
-    return numbers_in(holder if isinstance(holder, dict) else {"data": holder}, "data", path, count)
 
 
 def _ros_matrix(name: str, matrix: Array) -> str:

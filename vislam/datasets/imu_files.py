@@ -16,6 +16,7 @@ import numpy as np
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.datasets.calibration import NOISE_KEYS, Keys, list_text, load_yaml, numbers_in, parse_noise
+from vislam.datasets.foreign_cameras import foreign_noise, load_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 Calibration = TypeVar("Calibration", ImuCalibration, MagCalibration)
@@ -38,12 +39,12 @@ def imu_noise_text(noise: ImuNoise, comment: str) -> str:
 
 
 def read_noise(path: Path) -> ImuNoise:
-    """Return the noise model of Kalibr's imu.yaml or its results, of OpenVINS's IMU chain or of an ASL sensor.yaml.
+    """Return the noise model in a file of Kalibr (also its results), OpenVINS, ORB-SLAM, Basalt, or an ASL sensor.yaml.
 
     What the file states of the IMU beside its noise (T_i_b, time_offset, Tw) is warned of where it means anything.
     Raises DataError naming the key.
     """
-    data = Keys(load_yaml(path))
+    data = foreign_noise(load_keys(path), path)
     nested = [str(key) for key, value in data.items() if isinstance(value, dict) and set(NOISE_KEYS) & set(value)]
     if len(nested) > 1:
         one = ", ".join(nested)

@@ -33,7 +33,7 @@ from vislam.datasets.bags.stored import Topic
 from vislam.datasets.bags.streams import BagStreams, ImageTopic, messages_of
 from vislam.datasets.bags.transforms import Frames, rigid
 from vislam.datasets.calibrated import joined_rig
-from vislam.datasets.camera_files import ros_camera
+from vislam.datasets.foreign_cameras import ros_camera
 from vislam.datasets.formats.truth import Truth, trajectory_of
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_files import read_noise

@@ -1,0 +1,309 @@
+"""Calibrations of other programs, recognised by their content: VINS, ORB-SLAM, Basalt, ROS, OpenCV.
+
+Every pose that they write is the camera's in the IMU (`body_T_cam0`, `Tbc`, `T_imu_cam`), or the right camera's in the
+left one's.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from vislam.core.camera import Camera, Distortion
+from vislam.core.errors import DataError
+from vislam.core.geometry import are_rotations, rotation_from_quaternion_xyzw, transform
+from vislam.core.messages import Array
+from vislam.core.reading import read_text
+from vislam.datasets.calibration import MAX_YAML_BYTES, NOISE_KEYS, WEIGHTY, Keys, load_yaml, numbers_in
+from vislam.datasets.tables import check_size
+
+_RATIONAL = "rational_polynomial"
+_RADTAN = ("k1", "k2", "p1", "p2")
+_FULL = (*_RADTAN, "k3", "k4", "k5", "k6")
+_RIGID = 1e-3
+_OPENCV = {  # what its programs and ROS's messages call the same, in small letters without underscores
+    "cameramatrix": "camera_matrix", "k": "camera_matrix", "distortioncoefficients": "distortion_coefficients",
+    "distcoeffs": "distortion_coefficients", "d": "distortion_coefficients", "imagewidth": "image_width",
+    "width": "image_width", "imageheight": "image_height", "height": "image_height",
+    "distortionmodel": "distortion_model", "fisheyemodel": "fisheye_model",
+}  # fmt: skip
+_OPENCV_SILENT = (  # of a message, and of the program that calibrates
+    "header", "R", "r", "P", "p", "roi", "calibration_time", "calibration_Time", "nframes", "nrOfFrames", "flags",
+    "board_width", "board_height", "square_size", "avg_reprojection_error", "per_view_reprojection_errors",
+    "extrinsic_parameters", "image_points", "grid_points",
+)  # fmt: skip
+_ORB_NOISE = dict(
+    zip(("IMU.NoiseGyro", "IMU.NoiseAcc", "IMU.GyroWalk", "IMU.AccWalk"), NOISE_KEYS, strict=True),
+    **{"IMU.Frequency": "update_rate"},
+)
+_BASALT_NOISE = dict(
+    zip(("gyro_noise_std", "accel_noise_std", "gyro_bias_std", "accel_bias_std"), NOISE_KEYS, strict=True),
+    imu_update_rate="update_rate",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StatedCamera:
+    """What a file states of one camera."""
+
+    camera: Camera
+    T_body_cam: Array | None = None  # [4, 4]
+    T_before_cam: Array | None = None  # [4, 4], in the camera before it
+    time_offset_s: float | None = None  # to be added to its stamps to get the IMU's time
+
+
+def load_keys(path: Path) -> Keys:
+    """Return the mapping in a file of YAML, JSON or OpenCV's XML; raises DataError when it holds none."""
+    check_size(path, MAX_YAML_BYTES)
+    try:
+        text = read_text(path, MAX_YAML_BYTES).lstrip("\ufeff \t\r\n")
+        if not text.startswith(("{", "<")):
+            return Keys(load_yaml(path))
+        data = json.loads(text) if text.startswith("{") else _xml(text)
+    except (OSError, ValueError, RecursionError, ElementTree.ParseError) as error:
+        raise DataError(f"{path} cannot be read as JSON or XML: {' '.join(str(error).split())[:200]}") from error
+    return Keys(data)
+
+
+def foreign_cameras(data: Keys, path: Path) -> list[StatedCamera] | None:
+    """Return what a file of another program states of its first two cameras, None where it is none of those.
+
+    Raises DataError naming the program and what it lacks, or the camera model that vislam does not have.
+    """
+    for name, is_one, read in _PROGRAMS:
+        if is_one(data):
+            try:
+                return read(data, path)
+            except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError) as error:
+                what = f"no {error}" if isinstance(error, KeyError) else str(error)
+                raise DataError(f"{path} looks like a file of {name}, but it cannot be used: {what[:120]}") from error
+    return None
+
+
+def foreign_noise(data: Keys, path: Path) -> Keys:
+    """Return the noise that ORB-SLAM or Basalt states in Kalibr's keys, the data itself where it is of neither.
+
+    Raises DataError for VINS, whose figures are no densities.
+    """
+    if "acc_n" in data:
+        raise DataError(
+            f"{path} is VINS's: its acc_n and gyr_n are tuned figures, not densities; give Kalibr's imu.yaml, or run "
+            "`vislam calibrate noise`"
+        )
+    inner = data.get("value0")
+    for names, holder in ((_BASALT_NOISE, inner), (_ORB_NOISE, data)):
+        if isinstance(holder, dict) and any(name in holder for name in names):
+            stated = {key: numbers_in(holder, name, path) for name, key in names.items() if name in holder}
+            return Keys({key: max(values, default=None) for key, values in stated.items()})
+    return data
+
+
+def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list[float], where: str) -> Camera:
+    """Return the camera that ROS describes by K [3, 3], its distortion's name and coefficients.
+
+    Raises DataError for a lens that vislam does not have.
+    """
+    width, height = size_px
+    if name in ("equidistant", "fisheye", "kannala_brandt") and len(coefficients) >= 4 and not any(coefficients[4:]):
+        model: Distortion = "equidistant"
+        coefficients = coefficients[:4]
+    elif name in ("plumb_bob", _RATIONAL, "none", "") and not any(coefficients):
+        model = "none"
+    elif name in ("plumb_bob", _RATIONAL) and not any(coefficients[5:]):
+        model = "radtan"
+        coefficients = (coefficients + [0.0] * 4)[: 5 if len(coefficients) > 4 and coefficients[4] != 0.0 else 4]
+    elif name == _RATIONAL and not any(coefficients[8:]):  # thin prisms and tilted sensors are behind the eighth
+        model = "rational"
+        coefficients = (coefficients + [0.0] * 8)[:8]
+    else:
+        raise DataError(
+            f"{where}: '{name}' with {len(coefficients)} coefficients is not supported; use plumb_bob, "
+            f"{_RATIONAL} with 8, or equidistant with 4"
+        )
+    try:
+        return Camera(
+            width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model,
+            () if model == "none" else tuple(coefficients),
+        )  # fmt: skip
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+
+
+def _ros_or_opencv(data: Keys, path: Path) -> list[StatedCamera]:
+    if "fx" in data:
+        raise ValueError("camera_matrix and fx at once")
+    named = {_OPENCV.get(str(key).lower().replace("_", ""), str(key)): value for key, value in data.items()}
+    keys = Keys(named)
+    K = np.array(_matrix(keys, "camera_matrix", path, 9)).reshape(3, 3)
+    sizes = {key: [keys.get(key)] for key in ("image_width", "image_height")}
+    width, height = (int(numbers_in(sizes, key, path, 1)[0]) for key in sizes)
+    coefficients = _matrix(keys, "distortion_coefficients", path)
+    # a message names its model; OpenCV's program writes whether it is a fisheye, else the number of coefficients does
+    usual = "plumb_bob" if len(coefficients) <= 5 else _RATIONAL
+    is_fisheye = str(keys.get("fisheye_model", 0)) not in ("0", "False", "None")
+    name = "fisheye" if is_fisheye else str(keys.get("distortion_model", usual))
+    pose = _pose(keys, "T_BS", path)
+    camera = ros_camera((width, height), K, name, coefficients, str(path))
+    if any(str(keys.get(f"binning_{axis}", 0)) not in ("0", "1") for axis in "xy"):
+        raise DataError(f"{path}: binning is not read; calibrate at the size that is recorded")
+    keys.name_unused(path, "T_BS", known=_OPENCV_SILENT)
+    return [StatedCamera(camera, pose)]
+
+
+def _vins(data: Keys, path: Path) -> list[StatedCamera]:
+    td = data.get("td")
+    offset_s = None if td is None else float(td)
+    found = []
+    if "model_type" in data:
+        R, t = (data.get(f"extrinsic{name}") for name in ("Rotation", "Translation"))
+        T = _pose(data, "body_T_cam0", path)
+        if R is not None and t is not None:
+            T = transform(
+                np.reshape(_matrix(data, "extrinsicRotation", path, 9), (3, 3)),
+                np.array(_matrix(data, "extrinsicTranslation", path, 3)),
+            )
+        found.append(StatedCamera(_vins_lens(data, path), T, time_offset_s=offset_s))
+    else:
+        for k in range(2):
+            if data.get(f"cam{k}_calib") is not None:
+                beside = path.with_name(Path(str(data[f"cam{k}_calib"])).name)
+                T = _pose(data, f"body_T_cam{k}", path)
+                found.append(StatedCamera(_vins_lens(load_keys(beside), beside), T, time_offset_s=offset_s))
+    if str(data.get("estimate_extrinsic", 0)) == "2":  # by which the poses are placeholders
+        found = [StatedCamera(one.camera, time_offset_s=offset_s) for one in found]
+    _refuse_weighty(data, path, "body_T_cam0 and td")
+    return found
+
+
+def _vins_lens(data: Keys, path: Path) -> Camera:
+    kind = str(data["model_type"])
+    projection, size = data["projection_parameters"], [int(data[f"image_{side}"]) for side in ("width", "height")]
+    if kind in ("PINHOLE", "PINHOLE_FULL"):
+        K = _intrinsics(*(float(projection[name]) for name in ("fx", "fy", "cx", "cy")))
+        k = [float(data["distortion_parameters"].get(name, 0.0)) for name in _FULL[: 4 if kind == "PINHOLE" else 8]]
+        return ros_camera((size[0], size[1]), K, _RATIONAL, k, str(path))
+    if kind == "KANNALA_BRANDT":
+        K = _intrinsics(*(float(projection[name]) for name in ("mu", "mv", "u0", "v0")))
+        k = [float(projection[name]) for name in ("k2", "k3", "k4", "k5")]
+        return ros_camera((size[0], size[1]), K, "equidistant", k, str(path))
+    raise DataError(f"{path}: VINS's camera model {kind} is not supported; use PINHOLE or KANNALA_BRANDT")
+
+
+def _orb_slam(data: Keys, path: Path) -> list[StatedCamera]:
+    if "LEFT.K" in data:
+        raise DataError(
+            f"{path}: ORB-SLAM's older settings with LEFT.K and RIGHT.K are not supported; write Camera1.fx ..., "
+            "Camera2.fx ... and Stereo.T_c1_c2, as since its version 1.0"
+        )
+    first = "Camera1" if "Camera1.fx" in data else "Camera"
+    T_body_cam = _pose(data, "IMU.T_b_c1", path)
+    T_body_cam = _pose(data, "Tbc", path) if T_body_cam is None else T_body_cam
+    T_c1_c2 = _pose(data, "Stereo.T_c1_c2", path)
+    T_c1_c2 = _pose(data, "Tlr", path) if T_c1_c2 is None else T_c1_c2
+    found = [StatedCamera(_orb_lens(data, first, path), T_body_cam)]
+    if data.get("Stereo.b") is not None or (data.get("Camera.bf") is not None and "Camera2.fx" not in data):
+        b_m = data.get("Stereo.b")
+        b_m = float(data["Camera.bf"]) / found[0].camera.fx if b_m is None else float(b_m)
+        if "DepthMapFactor" not in data and "RGBD.DepthMapFactor" not in data:  # else it is a made-up one, of depth
+            T = transform(np.eye(3), np.array([b_m, 0.0, 0.0]))
+            found.append(StatedCamera(found[0].camera, None if T_body_cam is None else T_body_cam @ T, T))
+    elif "Camera2.fx" in data and T_c1_c2 is not None:
+        T = None if T_body_cam is None else T_body_cam @ T_c1_c2
+        found.append(StatedCamera(_orb_lens(data, "Camera2", path), T, T_c1_c2))
+    _refuse_weighty(data, path, "IMU.T_b_c1 and Stereo.T_c1_c2")
+    return found
+
+
+def _orb_lens(data: Keys, name: str, path: Path) -> Camera:
+    kind = str(data.get("Camera.type", "PinHole"))
+    width, height = (int(data[f"Camera.{side}"]) for side in ("width", "height"))
+    K = _intrinsics(*(float(data[f"{name}.{of}"]) for of in ("fx", "fy", "cx", "cy")))
+    if kind == "KannalaBrandt8":
+        k = [float(data[f"{name}.k{i}"]) for i in range(1, 5)]
+        return ros_camera((width, height), K, "equidistant", k, str(path))
+    if kind not in ("PinHole", "Rectified"):
+        raise DataError(f"{path}: ORB-SLAM's camera model {kind} is not supported; use PinHole or KannalaBrandt8")
+    k = [float(data.get(f"{name}.{of}", 0.0)) for of in _FULL[:5]]
+    return ros_camera((width, height), K, "none" if kind == "Rectified" else "plumb_bob", k, str(path))
+
+
+def _basalt(data: Keys, path: Path) -> list[StatedCamera]:
+    keys = Keys(data["value0"])
+    offset_s = float(keys.get("cam_time_offset_ns") or 0.0) * 1e-9
+    lists = (keys["intrinsics"], keys["resolution"], keys["T_imu_cam"])
+    found = []
+    for lens, size, pose in list(zip(*lists, strict=False))[:2]:
+        kind, values = str(lens["camera_type"]), lens["intrinsics"]
+        models = {"pinhole": ("none", ()), "kb4": ("equidistant", ("k1", "k2", "k3", "k4"))}
+        models["pinhole-radtan8"] = (_RATIONAL, _FULL)
+        if kind not in models:
+            raise DataError(
+                f"{path}: Basalt's camera model {kind} is not supported; calibrate with kb4, or with Kalibr"
+            )
+        name, of = models[kind]
+        K = _intrinsics(*(float(values[part]) for part in ("fx", "fy", "cx", "cy")))
+        camera = ros_camera((int(size[0]), int(size[1])), K, name, [float(values[k]) for k in of], str(path))
+        q = np.array([float(pose[f"q{axis}"]) for axis in "xyzw"])
+        if not abs(np.linalg.norm(q) - 1.0) < _RIGID:
+            raise DataError(f"{path}: a quaternion of T_imu_cam is not of length 1: {q.tolist()}")
+        R = rotation_from_quaternion_xyzw(q[None] / np.linalg.norm(q))[0]
+        T = transform(R, np.array([float(pose[f"p{axis}"]) for axis in "xyz"]))
+        found.append(StatedCamera(camera, T, time_offset_s=offset_s))
+    keys.name_unused(path, "T_imu_cam and cam_time_offset_ns", known=_BASALT_NOISE)
+    return found
+
+
+_PROGRAMS: tuple[tuple[str, Callable[[Keys], bool], Callable[[Keys, Path], list[StatedCamera]]], ...] = (
+    ("Basalt", lambda data: isinstance(data.get("value0"), dict), _basalt),
+    ("VINS", lambda data: "model_type" in data or "cam0_calib" in data, _vins),
+    ("ORB-SLAM", lambda data: "Camera.fx" in data or "Camera1.fx" in data, _orb_slam),
+    ("ROS or OpenCV", lambda data: any(
+        _OPENCV.get(str(key).lower().replace("_", "")) == "camera_matrix" for key in data), _ros_or_opencv),
+)  # fmt: skip
+
+
+def _refuse_weighty(data: Keys, path: Path, instead: str) -> None:
+    """Refuse poses and times that were not used; the other keys of a settings file are the program's own affair."""
+    harmless = [str(key) for key in data if not WEIGHTY.search(str(key)) or str(key).startswith("ORBextractor.")]
+    data.name_unused(path, instead, known=harmless)
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Array:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _matrix(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
+    holder = data.get(key)
+    return numbers_in(holder if isinstance(holder, dict) else {"data": holder}, "data", path, count)
+
+
+def _pose(data: Keys, key: str, path: Path) -> Array | None:
+    """Return a pose [4, 4], None where there is none."""
+    if data.get(key) is None:
+        return None
+    T = np.reshape(_matrix(data, key, path, 16), (4, 4))
+    if not are_rotations(T[:3, :3], _RIGID):
+        raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
+    return T
+
+
+def _xml(text: str) -> dict[str, Any]:
+    """Return the mapping in OpenCV's XML: matrices as in its YAML, all else as text."""
+    if re.search(r"<!(DOCTYPE|ENTITY)", text):
+        raise ValueError("OpenCV writes no document type and no entities")
+    root = ElementTree.fromstring(text)
+    if root.tag != "opencv_storage":
+        raise ValueError(f"it holds <{root.tag[:40]}>, not <opencv_storage>")
+    found: dict[str, Any] = {}
+    for child in root:
+        data = child.find("data")
+        words = ((child.text if data is None else data.text) or "").split()
+        found[child.tag] = {"data": words} if data is not None else " ".join(words).strip('"')
+    return found
