@@ -491,7 +491,26 @@ def _calibrations() -> list[dict[str, bytes]]:
         b"distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0, 0, 0, 0, 0]\n"
     )
     memory = b'{"gyro_biases": [{"temperature_c": 20.0, "gyro_bias_rad_s": [0.01, 0.0, 0.0]}]}'
-    return [{"c.yaml": chain}, {"c.yaml": info}, {"c.yaml": _SENSOR}, {"c.yaml": _IMU}, {"c.yaml": memory}]
+    lens = b"fx: 5.0\n%sfy: 5.0\n%scx: 4.0\n%scy: 3.0\n"
+    orb = b'%YAML:1.0\nCamera.type: "PinHole"\nCamera.width: 8\nCamera.height: 6\nCamera1.' + lens % (
+        (b"Camera1.",) * 3
+    )
+    vins = (
+        b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 8\nimage_height: 6\ndistortion_parameters:\n   k1: 0.0\n"
+        b"projection_parameters:\n   " + lens % ((b"   ",) * 3) + b"td: 0.01\nextrinsicTranslation: [0, 0, 1]\n"
+    )
+    basalt = (
+        b'{"value0": {"T_imu_cam": [{"px": 0, "py": 0, "pz": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1}],'
+        b' "resolution": [[8, 6]], "intrinsics": [{"camera_type": "pinhole", "intrinsics": {"fx": 5,'
+        b' "fy": 5, "cx": 4, "cy": 3}}]}}'
+    )
+    xml = (
+        b"<?xml version='1.0'?>\n<opencv_storage><image_width>8</image_width><image_height>6</image_height>\n"
+        b"<camera_matrix><data>5 0 4 0 5 3 0 0 1</data></camera_matrix>\n"
+        b"<distortion_coefficients><data>0 0 0 0</data></distortion_coefficients></opencv_storage>"
+    )
+    all_ = (chain, info, _SENSOR, _IMU, memory, orb, vins, basalt, xml)
+    return [{"c.yaml": text} for text in all_]
 
 
 def _read_calibrations(folder: Path) -> None:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_types_from_msg
 
 from vislam.cli import run_verb
 from vislam.config import CalibrationConfig, FrontEndConfig
@@ -21,7 +22,7 @@ from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.inspect import inspect
 from vislam.frontend import mode_for
-from worlds.bag_writer import KINDS, Message, Types, from_asl, types_of, write_bag
+from worlds.bag_writer import KINDS, ROS2, Message, Types, from_asl, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, HEIGHT, IMU_YAML, WIDTH, picture, write_asl
 
 K = np.array([[50.0, 0.0, 31.5], [0.0, 51.0, 23.5], [0.0, 0.0, 1.0]])
@@ -423,6 +424,34 @@ def test_a_gyroscope_alone_is_no_imu(tmp_path: Path, noise: CalibrationConfig) -
     path = write_bag(tmp_path, "mcap", [*images_of(types), *rates])
     with pytest.raises(DataError, match=r"forces are all zero.*imu=none"):
         open_dataset(str(path), noise)
+
+
+def test_a_bag_without_images_is_what_it_is(tmp_path: Path) -> None:
+    types = types_of("mcap")
+    poses = [Message(BEGIN_NS + i, "/vicon", types.pose_stamped(BEGIN_NS + i, [i, 0, 1])) for i in range(5)]
+    path = write_bag(tmp_path, "mcap", poses)
+    errors = [f.what for f in inspect(str(path)).findings if f.severity == "error"]
+    assert len(errors) == 1
+    assert f"there are /vicon; its poses can be evaluated: vislam eval {path} --topic /vicon" in errors[0]
+    with pytest.raises(DataError, match="no camera images that can be read; there are /vicon"):
+        open_dataset(str(path))
+
+
+def test_video_in_a_bag_is_named_and_an_imu_beside_it_does_not_hide_it(
+    tmp_path: Path, noise: CalibrationConfig
+) -> None:
+    kind = "foxglove_msgs/msg/CompressedVideo"
+    text = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+    ROS2.register(get_types_from_msg(text, kind))
+    types = types_of("mcap")
+    stamp = types.header(BEGIN_NS, "").stamp
+    video = types.make(kind, timestamp=stamp, frame_id="cam0", data=np.zeros(9, np.uint8), format="h264")
+    messages = [Message(BEGIN_NS, "/video", video)]
+    messages += [Message(t, "/imu", types.imu(t, [0.1, 0, 0, 0, 0, 9.8])) for t in range(BEGIN_NS, BEGIN_NS + 40, 2)]
+    path = write_bag(tmp_path, "mcap", messages)
+    with pytest.raises(DataError, match=r"/video is video, which is not read: record CompressedImage.*cam0=none runs"):
+        open_dataset(str(path), noise)
+    assert open_dataset(f"{path},cam0=none", noise).rig.is_blind
 
 
 def test_cameras_that_transforms_put_at_one_place_are_named(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from vislam.core.errors import DataError, UsageError
 from vislam.datasets import READERS, open_dataset
+from vislam.datasets.inspect import inspect
 from worlds.mini_recording import write_asl
 
 
@@ -59,3 +60,30 @@ def test_a_file_without_permission_is_an_error_not_a_traceback(tmp_path: Path, m
     monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(DataError, match=r"data.csv cannot be read: Permission denied"):
         open_dataset(str(root))
+
+
+def test_a_pointer_of_git_lfs_is_named_as_one(tmp_path: Path) -> None:
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:" + "4d" * 32 + "\nsize 12345\n"
+    mav0 = write_asl(tmp_path, stereo=False)
+    for name in ("drive.mcap", "drive.db3", "drive.bag"):
+        (tmp_path / name).write_text(pointer)
+        with pytest.raises(DataError, match=f"{name} cannot be read: a Git LFS pointer.*git lfs pull"):
+            open_dataset(f"bag:{tmp_path / name}")
+    for image in (mav0 / "cam0" / "data").iterdir():
+        image.write_text(pointer)
+    assert any("Git LFS pointer" in f.what for f in inspect(str(mav0)).findings)
+    for name in ("imu0/data.csv", "cam0/sensor.yaml"):
+        kept = (mav0 / name).read_text()
+        (mav0 / name).write_text(pointer)
+        assert any(f"{name} cannot be read: a Git LFS" in f.what for f in inspect(str(mav0)).findings)
+        (mav0 / name).write_text(kept)
+
+
+def test_a_folder_is_opened_through_a_link(tmp_path: Path) -> None:
+    mav0 = write_asl(tmp_path / "there", stereo=False)
+    (tmp_path / "link").symlink_to(mav0.parent)
+    (tmp_path / "mav0").mkdir()
+    for part in ("cam0", "imu0"):
+        (tmp_path / "mav0" / part).symlink_to(mav0 / part)
+    for path in (tmp_path / "link", tmp_path):
+        assert len(list(open_dataset(str(path)).events())) == len(list(open_dataset(str(mav0)).events())) > 6

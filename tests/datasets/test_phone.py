@@ -15,6 +15,8 @@ from vislam.core.messages import Frame, ImuSample
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.imu_pairs import paired
 from vislam.datasets.inspect import inspect
+from vislam.datasets.sensor_files import local_frame, sensor_readings
+from vislam.sensors.toml import load_sensor_setup
 from worlds import gopro
 from worlds.mini_recording import IMU_YAML, camera_yaml, picture
 
@@ -295,3 +297,23 @@ def test_the_noise_of_a_phone_can_be_found_before_it_is_told(tmp_path):
     (folder / "imu.yaml").unlink()
     table = read_inertial(folder)
     np.testing.assert_allclose(table.values[:, 3:], force(since_begin(table.t_ns)), atol=1e-6)
+
+
+def test_the_location_of_a_phone_is_a_receivers(tmp_path):
+    header = (
+        "time,seconds_elapsed,bearingAccuracy,verticalAccuracy,horizontalAccuracy,bearing,altitude,longitude,latitude"
+    )
+    rows = [f"{BEGIN_NS + i * 10**9},{i},0,3.0,{4.0 if i != 2 else -1},0,400.0,8.0,{47.0 + i * 1e-5}" for i in range(5)]
+    (tmp_path / "Location.csv").write_text("\n".join([header, *rows]) + "\n")
+    (tmp_path / "cart.toml").write_text('[sensors.gnss]\nkind = "position"\nfile = "Location.csv"\n')
+    setup = load_sensor_setup(tmp_path / "cart.toml")
+    file, problems = setup.files["gnss"], Problems()
+    readings = list(sensor_readings("gnss", setup.sensors["gnss"], file, problems))
+    assert [r.t_ns for r in readings] == [BEGIN_NS + i * 10**9 for i in (0, 1, 3, 4)]
+    assert readings[-1].values == pytest.approx([0.0, 4e-5 * 111_174.0, 0.0], abs=0.01)
+    sigma = 4.0 / np.sqrt(-2.0 * np.log(0.32))
+    assert np.sqrt(np.diag(readings[0].covariance)) == pytest.approx([sigma, sigma, 3.0])
+    assert local_frame(file).datum.latitude_deg == 47.0
+    (tmp_path / "Location.csv").write_text(header.replace("altitude", "height") + "\n")
+    with pytest.raises(DataError, match="no column altitude"):
+        list(sensor_readings("gnss", setup.sensors["gnss"], file, problems))

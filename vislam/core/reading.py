@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 _MAX_JSON_BYTES = 256 * 2**20  # metrics of the longest runs come to a tenth
+_POINTER, _MAX_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
 _MAX_TEXT_BYTES = 16 * 2**20  # settings, plans, calibrations
 
 
@@ -23,7 +24,12 @@ def open_file(path: Path) -> BufferedReader:
     # without O_NONBLOCK the call itself would wait for a writer of a FIFO
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
-        _check_mode(os.fstat(descriptor).st_mode, path)
+        found = os.fstat(descriptor)
+        _check_mode(found.st_mode, path)
+        if found.st_size <= _MAX_POINTER_BYTES and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
+            raise OSError(
+                errno.EINVAL, "a Git LFS pointer, not the file that it stands for; run git lfs pull", str(path)
+            )
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -32,7 +38,7 @@ def open_file(path: Path) -> BufferedReader:
 
 def check_file(path: Path) -> None:
     """Raise OSError unless a path is that of a regular file; for files that a library opens by their names."""
-    _check_mode(path.stat().st_mode, path)
+    open_file(path).close()
 
 
 def read_bytes(path: Path, most_bytes: int) -> bytes:

@@ -139,7 +139,9 @@ def load_yaml(path: Path) -> dict[str, Any]:
         if len(lines) < len(text.splitlines()):  # OpenCV wants no space behind a colon
             lines = [re.sub(r"^(\s*[A-Za-z_][\w.]*):(?=[\w\[\"+-])", r"\1: ", line) for line in lines]
         data = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(f"{path} cannot be read as YAML: {reason}") from error
     if not isinstance(data, dict):

@@ -67,7 +67,9 @@ def load_keys(path: Path) -> Keys:
         if not text.startswith(("{", "<")):
             return Keys(load_yaml(path))
         data = json.loads(text) if text.startswith("{") else _xml(text)
-    except (OSError, ValueError, RecursionError, ElementTree.ParseError) as error:
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError, ElementTree.ParseError) as error:
         raise DataError(f"{path} cannot be read as JSON or XML: {' '.join(str(error).split())[:200]}") from error
     return Keys(data)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
@@ -146,8 +147,13 @@ def probe(path: Path) -> tuple[int, int]:
     except FileNotFoundError as error:
         raise UnreadableImageError("missing image", path) from error
     except OSError as error:
-        raise UnreadableImageError("unreadable image", path) from error
+        raise UnreadableImageError(_kind_of(error), path) from error
     return _checked_size(head, tail, path)
+
+
+def _kind_of(error: OSError) -> str:
+    """Return what is wrong with an image that cannot be opened; what is no file of its kind is named."""
+    return f"image that is {error.strerror}" if error.errno == errno.EINVAL else "unreadable image"
 
 
 def _checked_size(head: bytes, tail: bytes, path: Path) -> tuple[int, int]:
@@ -163,7 +169,7 @@ def _decode(path: Path, camera: Camera, flags: int) -> NDArray[np.generic]:
     except FileNotFoundError as error:
         raise UnreadableImageError("missing image", path) from error
     except OSError as error:
-        raise UnreadableImageError("unreadable image", path) from error
+        raise UnreadableImageError(_kind_of(error), path) from error
     return decode_image(data, camera, flags, path)
 
 

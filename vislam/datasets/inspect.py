@@ -173,7 +173,7 @@ class _Inspector:
         found = self._found
         if not found.cameras and found.has_imu:
             self._add("ok", "no camera: it runs by the IMU and what --sensors.file names", str(found.root))
-        elif not found.cameras:
+        elif not found.cameras and not found.errors:
             self._add("error", "neither camera images nor an IMU", str(found.root), "it can be evaluated but not run")
         streams = [*found.cameras, *([found.depth] if found.depth is not None else [])]
         for index, images in enumerate(streams):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from vislam.core.recording import Problems
 from vislam.datasets.tables import MAX_LINE_BYTES, Row, in_time_order, parse_ns, parse_seconds, read_rows
 from vislam.datasets.telemetry import open_joined
 from vislam.sensors.configured import Configured
-from vislam.sensors.geodetic import LocalFrame
+from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
 from vislam.sensors.ticks import TickSpeeds
 from vislam.sensors.toml import SensorFile
@@ -25,6 +25,8 @@ from vislam.sensors.toml import SensorFile
 _HEADER_LINES = 20  # a header stands among the first ones
 _STAMPS: dict[str, Callable[[str], int]] = {"t_ns": parse_ns, "t_s": parse_seconds}
 _CHUNK_BYTES = 2**16
+_PLACE, _ACCURACIES = ("latitude", "longitude", "altitude"), ("horizontalAccuracy", "verticalAccuracy")
+_RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))  # that holds 68 % of two axes, in sigmas of one
 _TICKS = ("left_ticks", "right_ticks")
 
 
@@ -40,10 +42,10 @@ def sensor_readings(name: str, sensor: Configured, file: SensorFile, problems: P
         from vislam.datasets.bags import readings_of_topic
 
         readings = readings_of_topic(name, sensor, file, problems)
-    elif file.format == "csv":
-        readings = _counts(name, file, problems) if file.ticks else _table(name, sensor, file, problems)
+    elif (fixes := _fixes_of(file)) is not None:
+        readings = fixes(FixReadings(name, file.gnss), file, problems)
     else:
-        readings = _FIXES[file.format](FixReadings(name, file.gnss), file, problems)
+        readings = _counts(name, file, problems) if file.ticks else _table(name, sensor, file, problems)
     rows = ((reading.t_ns, reading) for reading in readings)
     shift_ns = round(file.offset_s * 1e9)
     for t_ns, reading in in_time_order(rows, problems, f"{file.path.parent.name}/{file.path.name}", keep_equal=True):
@@ -60,8 +62,8 @@ def local_frame(file: SensorFile) -> LocalFrame:
         from vislam.datasets.bags import first_fix
 
         first_fix(made, file)
-    if made.frame is None and file.format in _FIXES:
-        next(_FIXES[file.format](made, file, Problems()), None)
+    if made.frame is None and file.format != "bag" and (fixes := _fixes_of(file)) is not None:
+        next(fixes(made, file, Problems()), None)
     if made.frame is None:
         raise DataError(f"{file.path}: no datum is given and no fix is good enough to be one")
     return made.frame
@@ -121,14 +123,14 @@ def _row(asked: tuple[str, ...], header: tuple[str, ...], path: Path) -> Callabl
     return parse
 
 
-def _header(path: Path) -> tuple[str, ...]:
-    """Return the names of a table's columns, in a comment or not; empty: it does not say."""
+def _header(path: Path, of: Collection[str] = tuple(_STAMPS)) -> tuple[str, ...]:
+    """Return the names of a table's columns, in a comment or not, with one `of` them; empty: it does not say."""
     try:
         with open_file(path) as file:
             for _ in range(_HEADER_LINES):
                 line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace")
                 names = tuple(field.strip(' #\t\r\n"') for field in line.split(","))
-                if set(names) & set(_STAMPS):
+                if set(names) & set(of):
                     return names
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
@@ -172,7 +174,32 @@ def _gpmf(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[R
         yield from _made(fix, made, file, problems)
 
 
+def _location(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
+    """Yield the fixes of a phone's Location.csv (Sensor Logger); accuracies are radii of 68 %, negative: no fix."""
+    header = _header(file.path, _PLACE)
+    if missing := [name for name in ("time", *_PLACE, *_ACCURACIES) if name not in header]:
+        raise DataError(f"{file.path}: no column {missing[0]}; there are {', '.join(header)}; docs/sensors/gnss.md")
+    at = [header.index(name) for name in (*_PLACE, *_ACCURACIES)]
+
+    def parse(fields: list[str]) -> Row[Fix]:
+        if len(fields) <= max(at):
+            raise ValueError
+        latitude, longitude, height, radius, up = (float(fields[k]) for k in at)
+        t_ns, place = parse_ns(fields[header.index("time")]), Geodetic(latitude, longitude, height)
+        return t_ns, Fix(t_ns, place, "single" if radius > 0.0 and up > 0.0 else "none", radius / _RADIUS_68, up)
+
+    for _t_ns, fix in read_rows(file.path, parse, problems, ",", needs_line_end=True):
+        yield from _made(fix, made, file, problems)
+
+
 _FIXES = {"nmea": _nmea, "ubx": _ubx, "gpmf": _gpmf}
+
+
+def _fixes_of(file: SensorFile) -> Callable[[FixReadings, SensorFile, Problems], Iterator[Reading]] | None:
+    """Return what reads the fixes in a file that is no bag, None for a table of readings."""
+    if file.format == "csv" and {"latitude", "longitude"} <= set(_header(file.path, _PLACE)):
+        return _location
+    return _FIXES.get(file.format)
 
 
 def _made(fix: Fix | None, made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:

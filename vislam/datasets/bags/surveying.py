@@ -16,7 +16,7 @@ from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
-from vislam.datasets.bags.choice import NONE, BagOptions, Choice, ImageFacts, chosen, topics_there
+from vislam.datasets.bags.choice import NONE, TRUTHS, BagOptions, Choice, ImageFacts, chosen, topics_there
 from vislam.datasets.bags.decoding import (
     ODOMETRY,
     OLD_TRANSFORMS,
@@ -45,6 +45,7 @@ from vislam.trajectory import Trajectory
 
 _LOG = logging.getLogger(__name__)
 _LOOKED_AT_NS = 20_000_000_000  # of the inertial samples, to see whether their units can be
+_VIDEOS = ("CompressedVideo", "FFMPEGPacket")
 _CALIBRATION = "--calibration.camera FILE"
 _NOISE = "--calibration.imu-noise FILE"
 
@@ -88,10 +89,8 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         bag, [topic for _, topic in images], None if depth is None else depth[1], (samples[0], samples[1]), by_log_time,
         _forces(listing, choice, frames, body),
     )  # fmt: skip
-    has_others = any("Image" in entry.topic.type for entry in listing.entries.values()) and options.cam0 != NONE
-    if not images and (choice.imu is None or has_others):
-        go_on = "" if choice.imu is None else "; cam0=none runs without them"
-        found.errors.append(DataError(f"{path} has no camera images that can be read; {topics_there(listing)}{go_on}"))
+    if not images and options.cam0 != NONE and (lacks := _without_images(path, listing, choice)) is not None:
+        found.errors.append(lacks)
     noise = None
     if choice.imu is not None:
         noise = _noise(path, choice.imu, found)
@@ -118,6 +117,24 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         problems=found.problems,
         errors=tuple(found.errors),
     )
+
+
+def _without_images(path: Path, listing: Listing, choice: Choice) -> DataError | None:
+    """Return why a bag without images that can be read is not run, and what it is good for; None if its IMU runs it."""
+    kinds = {name: entry.topic.schema or entry.topic.type for name, entry in listing.entries.items()}
+    videos = [name for name, kind in kinds.items() if kind.endswith(_VIDEOS)]
+    if choice.imu is not None and not videos and not any("Image" in kind for kind in kinds.values()):
+        return None
+    poses = [entry.topic.name for entry in listing.of_type(*TRUTHS)]
+    steps = [
+        f"{name} is video, which is not read: record CompressedImage (JPEG), or film as video:FILE"
+        for name in videos[:1]
+    ]
+    if choice.imu is not None:
+        steps.append("cam0=none runs without them")
+    elif poses:
+        steps.append(f"its poses can be evaluated: vislam eval {path} --topic {poses[0]} --reference FILE")
+    return DataError("; ".join([f"{path} has no camera images that can be read", topics_there(listing), *steps]))
 
 
 def _forces(listing: Listing, choice: Choice, frames: Frames, body: str) -> tuple[Topic, Array] | None:

@@ -82,7 +82,8 @@ def opencv(distortion: str, size: str = "image_width: 64\nimage_height: 48\n", m
 
 XML = (
     '<?xml version="1.0"?>\n<opencv_storage>\n<calibration_Time>"Mon"</calibration_Time>\n'
-    '<image_Width>64</image_Width><image_Height>48</image_Height>\n<Camera_Matrix type_id="opencv-matrix">\n<rows>3</rows><dt>d</dt>\n'
+    "<image_Width>64</image_Width><image_Height>48</image_Height>\n"
+    '<Camera_Matrix type_id="opencv-matrix">\n<rows>3</rows><dt>d</dt>\n'
     f"<data>\n {K_TEXT.replace(',', ' ')}</data></Camera_Matrix>\n<Distortion_Coefficients type_id='opencv-matrix'>"
     "<rows>5</rows><dt>d</dt><data>-0.1 0.01 1e-4 2e-4 0.</data></Distortion_Coefficients></opencv_storage>"
 )
