@@ -11,7 +11,7 @@ from test_other_formats import write_kitti, write_tum, write_video
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import so3_exp, so3_log
-from vislam.datasets.camera_turns import fit_turns, follow_turns
+from vislam.datasets.camera_turns import fit_turns, follow_turns, judged_turns
 from vislam.datasets.inspect import Inspection, inspect
 from vislam.datasets.plausibility import epipolar_facts
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
@@ -236,6 +236,9 @@ def test_turn_seen_by_camera_and_gyro() -> None:
     expected = np.linalg.norm(so3_log(R_body_cam @ turn.T @ R_body_cam.T @ R_body_cam.T @ turn @ R_body_cam))
     assert wrong is not None and wrong.differ > 0.5
     assert wrong.differ == pytest.approx(expected / np.linalg.norm(rate * 0.15), abs=0.1)
+    for R, tried in ((R_body_cam.T, "with the inverse they differ by"), (np.diag([1.0, -1, -1]) @ R_body_cam, "check")):
+        (judged,) = judged_turns(CAMERA, R, tracks, lambda: rows, np.zeros(3))
+        assert judged.severity == "error" and judged.next_step.startswith(tried)
     at_rest = [(t, [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]) for t, _ in rows]
     still = follow_turns(places, t_ns, lambda _: [images[0]])
     assert len(still) == 5 and fit_turns(CAMERA, R_body_cam, still, at_rest, np.zeros(3)) is None

@@ -319,11 +319,34 @@ def _misfit(camera: Camera, R_cam_body: Array, pairs: _Pairs, focal: float) -> f
     return float(np.median(np.where(np.isfinite(chi2), chi2, np.inf)))
 
 
-def turn_findings(fit: TurnFit) -> list[Finding]:
-    """Judge what would make camera and gyroscope fit: wrong is what its sigma and a good calibration do not explain."""
+def judged_turns(
+    camera: Camera,
+    R_body_cam: Array,
+    tracks: Sequence[TurnTracks],
+    rows: Callable[[], Iterable[Row[list[float]]]],
+    bias_rad_s: Array,
+) -> list[Finding]:
+    """Judge how turns of tracks fit a gyroscope's, as `fit_turns` takes them; where they do not, the inverse is tried.
+
+    Empty where fewer than three places turn. `rows` begins anew at every call.
+    """
+    fit = fit_turns(camera, R_body_cam, tracks, rows(), bias_rad_s)
+    if fit is None:
+        return []
+    inverse = fit_turns(camera, R_body_cam.T, tracks, rows(), bias_rad_s) if fit.differ > _WRONG else None
+    return turn_findings(fit, None if inverse is None else inverse.differ)
+
+
+def turn_findings(fit: TurnFit, inverse_differs: float | None = None) -> list[Finding]:
+    """Judge what would make camera and gyroscope fit: wrong is what its sigma and a good calibration do not explain.
+
+    `inverse_differs` is as `fit.differ`, with the inverse of the rotation.
+    """
     what = f"turns seen by cam0 and by the gyro differ by {100.0 * fit.differ:.0f} % in {fit.places} places"
     if fit.differ > _WRONG:
         step = "check the rotation in T_BS (is it the camera in the body, not the body in the camera?) and the clocks"
+        if inverse_differs is not None and inverse_differs < _WRONG:
+            step = f"with the inverse they differ by {100.0 * inverse_differs:.0f} %: write the inverse of its pose"
         return [Finding("error", f"{what}: extrinsics or time stamps are wrong", "cam0", step)]
     judged = [] if fit.x is None or fit.covariance is None else _judged(fit.x, fit.covariance)
     wrong = [Finding("warning", f"by the gyro's turns {text}", "cam0", step) for bad, text, step in judged if bad]

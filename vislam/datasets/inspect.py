@@ -16,7 +16,7 @@ from vislam.core.findings import Finding, Severity, worst
 from vislam.core.progress import Progress, silent
 from vislam.core.recording import Problems
 from vislam.datasets import survey as survey_recording
-from vislam.datasets.camera_turns import fit_turns, follow_turns, turn_findings, turn_places
+from vislam.datasets.camera_turns import follow_turns, judged_turns, turn_places
 from vislam.datasets.images import (
     DepthFormat,
     ImageList,
@@ -323,7 +323,12 @@ class _Inspector:
             step = "check T_BS of both cameras, and that their images are not swapped"
             self._add("error", f"{what}: the extrinsics do not fit", "cam1", step)
         elif facts.in_front < _MIN_ON_LINE:
-            self._add("error", f"{what}, but behind the cameras", "cam1", "cam0 and cam1 seem to be swapped")
+            self._add(
+                "error",
+                f"{what}, but behind the cameras",
+                "cam1",
+                "cam0 and cam1 seem to be swapped, or their poses inverted",
+            )
         else:
             self._add("ok", what, "cam1")
 
@@ -331,8 +336,7 @@ class _Inspector:
         with closing(open_loader(self._found, rig, frames, 1)) as loader:
             tracks = follow_turns(turn_places(facts, frames.t_ns), frames.t_ns, lambda frame: loader.load(frame).images)
         R_body_cam, bias = rig.T_body_cams[0][:3, :3], facts.gyro_bias_rad_s
-        fit = fit_turns(rig.cameras[0], R_body_cam, tracks, self._rows(Problems()), bias)
-        turns = [] if fit is None else turn_findings(fit)
+        turns = judged_turns(rig.cameras[0], R_body_cam, tracks, lambda: self._rows(Problems()), bias)
         self._findings += turns
         tilt_rad = camera_tilt_rad(facts, rig)
         tilt = f"gravity is {np.rad2deg(tilt_rad):.0f} deg from the vertical of cam0's image"
