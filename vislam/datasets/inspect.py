@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -295,17 +295,11 @@ class _Inspector:
         rig = self._found.rig
         if rig is None or frames is None or not len(frames.t_ns):
             return
-        if rig.is_stereo:
-            with self._as_finding():
-                self._judge_stereo(self._stereo_facts(rig, frames))
-        if facts is not None:
-            with self._as_finding():
-                self._judge_extrinsics(rig, frames, facts)
-
-    @contextmanager
-    def _as_finding(self) -> Iterator[None]:
         try:
-            yield
+            if facts is not None:
+                self._judge_extrinsics(rig, frames, facts)
+            if rig.is_stereo:
+                self._judge_stereo(self._stereo_facts(rig, frames))
         except DataError as error:
             self._add("error", str(error), str(self._found.root))
 
