@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from vislam.core.errors import DataError
 from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
+from vislam.mapping.octree.query import ray_cast
+from vislam.mapping.semantic.votes import voxel_centres, voxel_keys
 
 
 class SlowOctoMap:
@@ -184,6 +186,52 @@ def test_a_point_beyond_the_range_only_clears_the_way(insertion):
     assert len(grid.leaves().occupied_voxels()) == 0
     states = grid.state_at(np.array([[1.95, 0.05, 0.05], [2.25, 0.05, 0.05], [3.05, 0.05, 0.05]]))
     assert states.tolist() == [Occupancy.FREE, Occupancy.UNKNOWN, Occupancy.UNKNOWN]
+
+
+@pytest.mark.parametrize("resolution", [0.02, 0.05, 0.07, 0.1, 0.25])
+def test_points_on_the_border_of_voxels_read_back_as_occupied_where_octomap_has_them(resolution):
+    steps = np.arange(-120, 121) * resolution
+    points = np.stack([steps, np.roll(steps, 60), np.roll(steps, 120)], axis=1)
+    origin = np.full(3, 0.3 * resolution)
+    for point in points[::3]:
+        ours, theirs = Octree(resolution), pyoctomap.OcTree(resolution)
+        ours.insert(point[None], origin)
+        theirs.insertPointCloud(point[None], origin)
+        leaves = ours.leaves()
+        for asked in (point[None], point[None].astype(np.float32)):
+            assert ours.state_at(asked) == Occupancy.OCCUPIED
+            assert (leaves.log_odds_at(asked) > 0).all()
+            assert ray_cast(ours, asked, np.ones((1, 3)), 0.1).range_m == 0.0
+            assert voxel_centres(voxel_keys(asked, resolution), resolution) == pytest.approx(
+                resolution * (leaves.occupied_voxels() + 0.5)
+            )
+        centre = resolution * (leaves.occupied_voxels()[0] + 0.5)
+        assert theirs.isNodeOccupied(theirs.search(centre))
+
+
+@pytest.mark.parametrize("insertion", ["discretised", "full"])
+def test_what_was_hit_at_the_maximum_range_stays_as_in_octomap_or_is_cleared_as_asked(insertion):
+    origin, wall, far = np.full(3, 0.05), np.array([[2.04, 0.05, 0.05]]), np.array([[5.0, 0.05, 0.05]])
+    octomaps, clearing, theirs = Octree(0.1), Octree(0.1, clears_at_range=True), pyoctomap.OcTree(0.1)
+    for scan in [wall] * 3 + [far] * 10:
+        for grid in (octomaps, clearing):
+            grid.insert(scan, origin, 2.0, insertion)
+        theirs.insertPointCloud(scan, origin, max_range=2.0, discretize=insertion == "discretised")
+    assert theirs.isNodeOccupied(theirs.search(wall[0]))
+    assert octomaps.state_at(wall) == Occupancy.OCCUPIED
+    assert clearing.state_at(wall) == Occupancy.FREE
+    beyond = np.array([[2.15, 0.05, 0.05]])
+    assert clearing.state_at(beyond) == Occupancy.UNKNOWN
+    both = np.vstack([wall, far])
+    for _ in range(10):
+        clearing.insert(both, origin, 2.0, insertion)
+    assert clearing.state_at(wall) == Occupancy.OCCUPIED, "a point in it wins over the ray"
+
+
+def test_a_point_beyond_the_range_in_the_voxel_at_the_range_does_not_clear_it():
+    grid = Octree(0.1, clears_at_range=True)
+    grid.insert(np.array([[2.08, 0.05, 0.05]]), np.full(3, 0.05), 2.0, "full")
+    assert grid.state_at(np.array([[2.05, 0.05, 0.05]])) == Occupancy.UNKNOWN
 
 
 def test_clamping_lets_a_voxel_change_its_mind():

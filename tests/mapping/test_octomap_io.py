@@ -257,9 +257,10 @@ def ot_file(data, size, **changes):
         (b"ply\n" * 100, "start with"),
         (b"# Octomap OcTree binary file\n" + b"# padding\n" * 10**5, "no 'data' line"),
         (bt_file(b"", 0, tree="CountingOcTree"), "CountingOcTree"),
-        (ot_file(b"\0" * 5, 10**12), "promises"),
-        (ot_file(b"\0" * 4, 1), "promises"),
-        (ot_file(b"\0" * 5, 1, tree="ColorOcTree"), "promises"),
+        (ot_file(b"\0" * 4, 1), "ends inside"),
+        (ot_file(b"\0" * 5, 1, tree="ColorOcTree"), "ends inside"),
+        (ot_file(b"\0" * 7, 1), "bytes follow"),
+        (ot_file(b"", 3), "ends inside"),
         (ot_file(b"\0\0\0\0\1" * 40, 40), "16th level"),
         (ot_file(b"\0\0\0\0\1" * 4, 4), "ends inside"),
         (ot_file(b"\0\0\0\0\0" * 2, 2), "bytes follow"),
@@ -277,6 +278,37 @@ def test_damaged_and_hostile_files_are_errors(tmp_path, content, words):
     path.write_bytes(content)
     with pytest.raises(DataError, match=words):
         read_octree(path)
+
+
+@pytest.mark.parametrize("size", [0, 1, 10**12])
+@pytest.mark.parametrize("is_coloured", [False, True])
+def test_another_number_of_nodes_in_the_header_of_an_ot_is_stated_and_the_tree_is_read(
+    tmp_path, caplog, capsys, size, is_coloured
+):
+    octree = sample_map().leaves()
+    if is_coloured:
+        octree = octree.with_colors(octree.centres_m()[0], np.full((len(octree), 3), 7, np.uint8))
+    content = encode_ot(octree)
+    nodes = int(re.search(rb"size (\d+)", content)[1])
+    path = tmp_path / "a.ot"
+    path.write_bytes(content.replace(b"size %d" % nodes, b"size %d" % size))
+    assert encode_ot(read_octree(path)) == content
+    assert f"the header states {size} nodes, the tree has {nodes}" in caplog.text
+    caplog.clear()
+    assert run_verb(["map", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["leaves"] == len(octree)
+    assert str(path) in caplog.text
+    path.write_bytes(content)
+    caplog.clear()
+    read_octree(path)
+    assert caplog.text == ""
+
+
+def test_octomap_reads_an_ot_by_its_nodes_too(tmp_path):
+    content = encode_ot(sample_map().leaves())
+    (tmp_path / "a.ot").write_bytes(re.sub(rb"size \d+", b"size 2", content))
+    pyoctomap.OcTree(0.1).read(str(tmp_path / "a.ot")).write(str(tmp_path / "b.ot"))
+    assert (tmp_path / "b.ot").read_bytes() == content
 
 
 def test_random_bytes_neither_crash_nor_take_memory(tmp_path):

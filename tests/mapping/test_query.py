@@ -101,7 +101,7 @@ def test_rays_end_where_a_slow_search_of_all_voxels_says(seed, unknown):
     grid, rng = random_map(seed)
     corners, states = window(grid)
     ends = corners[(states == Occupancy.OCCUPIED) | ((states == Occupancy.UNKNOWN) & (unknown == "stop"))]
-    origins, directions = rng.uniform(-0.6, 0.6, (20, 3)), rng.normal(size=(20, 3))
+    origins, directions = rng.uniform(-0.6, 0.6, (20, 3)).astype(np.float32), rng.normal(size=(20, 3))
     directions[:3] = np.eye(3)  # along an axis
     max_range_m = float(rng.uniform(0.2, 0.8))
     hits = ray_cast(grid, origins, directions, max_range_m, unknown)

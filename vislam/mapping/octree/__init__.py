@@ -5,7 +5,7 @@ files are the same byte for byte (benchmarks/RESULTS.md). To be dropped if OctoM
 takes scans at less than twice these times, and lets a keyframe be taken back.
 """
 
-from vislam.mapping.octree.blocks import find_slot
+from vislam.mapping.octree.blocks import find_slot, keys_at
 from vislam.mapping.octree.columns import NEVER, Columns, ColumnStore
 from vislam.mapping.octree.correct import CorrectedOccupancy
 from vislam.mapping.octree.describe import describe_octree, describe_place
@@ -40,6 +40,7 @@ __all__ = [
     "encode_ot",
     "find_slot",
     "footprint_state",
+    "keys_at",
     "nearest_frontier",
     "nearest_obstacle",
     "ray_cast",

@@ -56,6 +56,20 @@ def _holds_any(table: NDArray[np.int64], keys: NDArray[np.int64]) -> bool:
     return found
 
 
+def keys_at(points_map_m: NDArray[np.floating], resolution_m: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return OctoMap's keys [N, 3] of points [N, 3], and which [N] are inside the key range; keys of others are -1.
+
+    OctoMap's points are float32: on the border of a voxel float64 may mean the one before.
+    """
+    with np.errstate(over="ignore"):
+        points = np.asarray(points_map_m).reshape(-1, 3).astype(np.float32).astype(np.float64)
+    scaled = np.floor((1.0 / resolution_m) * points)
+    inside: NDArray[np.bool_] = np.all((scaled >= -KEY_ORIGIN) & (scaled < KEY_ORIGIN), axis=1)
+    keys = np.full(points.shape, -1, np.int64)
+    keys[inside] = scaled[inside].astype(np.int64) + KEY_ORIGIN
+    return keys, inside
+
+
 class BlockPool:
     """Growing storage of voxel blocks; `keys[:count]` and `values[:count]` are in order of first use."""
 

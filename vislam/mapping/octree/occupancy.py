@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError, UsageError
 from vislam.core.files import replacing
 from vislam.core.messages import Array
-from vislam.mapping.octree.blocks import KEY_ORIGIN, BlockPool
+from vislam.mapping.octree.blocks import KEY_ORIGIN, BlockPool, keys_at
 from vislam.mapping.octree.levels import fill_from_octree, largest_log_odds
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot, read_octree
 from vislam.mapping.octree.scan import (
     LogOdds,
+    Rays,
     Voxels,
     apply_marks,
     cast_rays,
@@ -65,6 +66,9 @@ class Octree:
     Rays that graze a surface pass voxels which it goes through, and a few scans of that clear them. With a
     `miss_beside_probability` above `miss_probability` (None: the same, as OctoMap's), a miss counts so much less where
     the voxel is occupied and touches one that the same scan hit.
+
+    A ray that is cut off at the maximum range leaves the voxel that it is cut off in as it was, as OctoMap's does: what
+    was hit there stays for ever. With `clears_at_range` it is cleared, unless the ray's point lies in it.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class Octree:
         clamp_min_probability: float = 0.1192,
         clamp_max_probability: float = 0.971,
         miss_beside_probability: float | None = None,
+        clears_at_range: bool = False,
     ) -> None:
         beside = miss_probability if miss_beside_probability is None else miss_beside_probability
         probabilities = (hit_probability, miss_probability, clamp_min_probability, clamp_max_probability, beside)
@@ -84,6 +89,7 @@ class Octree:
             raise DataError(f"map probabilities must lie between 0 and 1 with min below max, got {probabilities}")
         self.resolution_m = float(resolution_m)
         self._hit, self._miss, self._low, self._high, self._beside = (log_odds(p) for p in probabilities)
+        self.clears_at_range = clears_at_range
         self.pool = BlockPool()  # of log-odds
         self._words = np.zeros(1 << 12, np.uint64)  # the scan's grid, kept between scans, all zero
 
@@ -142,7 +148,8 @@ class Octree:
         if insertion == "discretised":
             ends = end_voxels(points, self.resolution_m, base, nx, nxy, grid)
         beside = bool(self._beside != self._miss)
-        cast_rays(ends, origin, max_range_m, self.resolution_m, base, (nx, nxy), grid, beside)
+        rays = Rays(max_range_m, self.resolution_m, self.clears_at_range, beside)
+        cast_rays(ends, origin, rays, base, (nx, nxy), grid)
         keys, bits = pack_marks(marked_blocks(words, blocks), words, blocks, base)
         return ScanMarks(len(points), keys, bits)
 
@@ -224,12 +231,7 @@ class Octree:
         """
         if not 0 <= level <= TREE_LEVELS:
             raise DataError(f"an octree has the levels 0 (voxels) to {TREE_LEVELS} (all), asked for {level}")
-        points = np.asarray(points_map_m, dtype=np.float64).reshape(-1, 3)
-        scaled = np.floor(points * (1.0 / self.resolution_m))
-        inside = ((scaled >= -KEY_ORIGIN) & (scaled < KEY_ORIGIN)).all(axis=1)
-        keys = np.full(points.shape, -1, dtype=np.int64)
-        keys[inside] = scaled[inside].astype(np.int64) + KEY_ORIGIN
-        return largest_log_odds(self.pool, keys, level)
+        return largest_log_odds(self.pool, keys_at(points_map_m, self.resolution_m)[0], level)
 
     def state_at(self, points_map_m: NDArray[np.floating], level: int = 0) -> NDArray[np.int8]:
         """Return the `Occupancy` [N] at points [N, 3], of voxels or of the cubes of a level: see `log_odds_at`."""

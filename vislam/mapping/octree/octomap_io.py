@@ -7,6 +7,7 @@ red, green and blue (white: no colour), and 8 bits, one per child that exists.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ _REASONS = {
     _LEFT_OVER: "bytes follow the end of the tree",
 }
 _Bytes = NDArray[np.uint8]
+_LOG = logging.getLogger(__name__)
 
 
 def encode_bt(octree: OctreeLeaves) -> bytes:
@@ -65,7 +67,8 @@ def _header(title: bytes, kind: str, nodes: int, resolution_m: float) -> bytes:
 def read_octree(path: Path, occupied_probability: float = 0.971, free_probability: float = 0.1192) -> OctreeLeaves:
     """Return the octree of a `.bt` or `.ot` file, of which an inner node's own values are not kept.
 
-    Leaves of a `.bt` get OctoMap's clamping thresholds unless others are given. Raises DataError when the file is not a
+    Leaves of a `.bt` get OctoMap's clamping thresholds unless others are given. As in OctoMap, an `.ot` is read by its
+    nodes: another number in its header is logged as a warning. Raises DataError when the file is not a
     complete tree of kind OcTree or ColorOcTree. Memory is bounded by the file's size.
     """
     try:
@@ -120,18 +123,19 @@ def _checked_header(fields: dict[str, str], path: Path) -> tuple[str, float, int
 
 def _decode_full(data: bytes, kind: str, resolution_m: float, size: int, path: Path) -> OctreeLeaves:
     node_type = _node_type(kind)
-    if len(data) != size * node_type.itemsize:
-        raise DataError(
-            f"{path} is damaged: the header promises {size} nodes of {node_type.itemsize} bytes, "
-            f"{len(data)} bytes follow"
-        )
-    nodes = np.frombuffer(data, node_type)
+    nodes = np.frombuffer(data, node_type, len(data) // node_type.itemsize)
     children = np.ascontiguousarray(nodes["children"])
     leaves = np.flatnonzero(children == 0)
     starts, levels = np.empty(len(leaves), np.int64), np.empty(len(leaves), np.uint8)
     used = _decode_ot(children, starts, levels)
+    if size > 0 and len(nodes) == 0:
+        used = _TRUNCATED
+    elif used == len(nodes) and len(data) % node_type.itemsize:
+        used = _LEFT_OVER
     if used < 0:
-        raise DataError(f"{path} is damaged: {_REASONS[used]}")
+        raise DataError(f"{path} is damaged: {_REASONS[used]} ({len(data)} bytes, the header states {size} nodes)")
+    if used != size:  # OctoMap reads the nodes, whatever the header states
+        _LOG.warning("%s: the header states %d nodes, the tree has %d, which were read", path, size, used)
     values = nodes["value"][leaves].astype(np.float32)
     if not np.isfinite(values).all():
         raise DataError(f"{path} is damaged: a leaf's log-odds is not a finite number")

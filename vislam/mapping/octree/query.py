@@ -50,11 +50,12 @@ def ray_cast(
     """Follow rays from origins [N, 3] or [3] along directions [N, 3] to the first occupied voxel.
 
     "pass" looks through unknown voxels as if they were free, "stop" ends there. The origin's own voxel counts.
-    Cells are those of Amanatides and Woo's traversal (1987). Raises DataError on input that is not finite, a direction
-    of length zero or a range that is not positive.
+    Cells are those of Amanatides and Woo's traversal (1987), from the origin as float32. Raises DataError on input that
+    is not finite, a direction of length zero or a range that is not positive.
     """
     ways = _rows(directions, 3, "directions")
-    starts = np.broadcast_to(_rows(origins_m, 3, "ray origins"), ways.shape)
+    origins = _rows(origins_m, 3, "ray origins").astype(np.float32).astype(np.float64)
+    starts = np.broadcast_to(origins, ways.shape)
     lengths = np.linalg.norm(ways, axis=1)
     if not (lengths > 0.0).all():
         raise DataError(f"the direction of ray {int(np.flatnonzero(~(lengths > 0.0))[0])} has length zero")

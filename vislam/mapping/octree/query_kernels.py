@@ -40,7 +40,7 @@ def cast(origins: Array, directions: Array, max_range_m: float, stop: bool, reso
     border, between = np.empty(3), np.empty(3)
     for n in range(count):
         for a in range(3):
-            start, way = origins[n, a] / resolution, directions[n, a]
+            start, way = origins[n, a] * (1.0 / resolution), directions[n, a]
             key[a] = np.int64(np.floor(min(max(start, -1e9), 1e9))) + KEY_ORIGIN
             step[a] = 1 if way > 0.0 else (-1 if way < 0.0 else 0)
             between[a] = 1.0 / abs(way) if way != 0.0 else np.inf

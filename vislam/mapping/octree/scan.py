@@ -46,6 +46,15 @@ class LogOdds(NamedTuple):
     high: Any
 
 
+class Rays(NamedTuple):
+    """How the rays of a scan are followed."""
+
+    max_range_m: float  # negative: no limit
+    resolution: float
+    clears_at_range: bool  # a ray that is cut off clears the cell that it is cut off in
+    beside: bool  # free cells that touch an end, be it at a corner, have a mark of their own
+
+
 @njit(cache=True, nogil=True, inline="always")
 def voxel_key(inverse_resolution: float, coordinate: float) -> int:
     """Return OctoMap's key of a coordinate along one axis."""
@@ -135,13 +144,11 @@ def _bounds(points: _F32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @njit(cache=True, nogil=True)
-def cast_rays(points: _F32, origin: _F32, max_range_m: float, resolution: float, base: _I64, strides: tuple[int, int],
-              grid: _Bytes, beside: bool) -> None:  # fmt: skip
-    """Mark what one scan sees: free along the rays, occupied at ends within `max_range_m` (negative: no limit).
-
-    With `beside`, free cells that touch an end, be it at a corner, have a mark of their own.
-    """
+def cast_rays(points: _F32, origin: _F32, rays: Rays, base: _I64, strides: tuple[int, int], grid: _Bytes) -> None:
+    """Mark what one scan sees: free along the rays, occupied at ends within the range."""
     nx, nxy = strides
+    max_range_m, resolution, clears_at_range, beside = rays
+    inverse = 1.0 / resolution
     ox, oy, oz = origin[0], origin[1], origin[2]
     ends = np.full(len(points), -1, np.int64)
     for i in range(len(points)):
@@ -154,7 +161,13 @@ def cast_rays(points: _F32, origin: _F32, max_range_m: float, resolution: float,
             length, reach = np.float32(distance), np.float32(max_range_m)
             dx, dy, dz = dx / length, dy / length, dz / length
             point = ox + dx * reach, oy + dy * reach, oz + dz * reach
-            _cast((ox, oy, oz), point, resolution, base, nx, nxy, grid)
+            last = _cast((ox, oy, oz), point, resolution, base, nx, nxy, grid)
+            if clears_at_range and (
+                voxel_key(inverse, point[0]) != voxel_key(inverse, ex)
+                or voxel_key(inverse, point[1]) != voxel_key(inverse, ey)
+                or voxel_key(inverse, point[2]) != voxel_key(inverse, ez)
+            ):
+                grid[last] = FREE_MARK
     for i in range(len(points)):
         if ends[i] >= 0 and grid[ends[i]] != END_MARK:
             grid[ends[i]] = END_MARK

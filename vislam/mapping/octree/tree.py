@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.mapping.octree.blocks import BLOCK_VOXELS, KEY_ORIGIN
+from vislam.mapping.octree.blocks import BLOCK_VOXELS, KEY_ORIGIN, keys_at
 
 TREE_LEVELS = 16  # OctoMap's depth: a leaf of level 0 is one voxel, the root has level 16
 _MAX_VOXELS = 1 << 27  # taken apart: 3 GiB
@@ -46,15 +46,11 @@ class OctreeLeaves:
 
     def leaves_at(self, points_map_m: NDArray[np.floating]) -> NDArray[np.int64]:
         """Return the index [N] of the leaf around each point [N, 3]; -1 where there is none."""
-        points = np.asarray(points_map_m, dtype=np.float64).reshape(-1, 3)
-        out = np.full(len(points), -1, np.int64)
-        scaled = np.floor(points * (1.0 / self.resolution_m))
-        inside = (
-            np.isfinite(scaled).all(axis=1) & (scaled >= -KEY_ORIGIN).all(axis=1) & (scaled < KEY_ORIGIN).all(axis=1)
-        )
+        keys, inside = keys_at(points_map_m, self.resolution_m)
+        out = np.full(len(keys), -1, np.int64)
         if len(self) == 0 or not inside.any():
             return out
-        codes = morton_encode(scaled[inside].astype(np.int64) + KEY_ORIGIN)
+        codes = morton_encode(keys[inside])
         leaf = np.searchsorted(self.starts, codes, side="right") - 1
         ends = self.starts[leaf] + (np.int64(1) << (3 * self.levels[leaf].astype(np.int64)))
         out[inside] = np.where((leaf >= 0) & (codes < ends), leaf, -1)

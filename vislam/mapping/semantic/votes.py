@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.mapping.octree import find_slot
+from vislam.mapping.octree import find_slot, keys_at
 
 KEPT = 4  # labels of one place
 KEY_ORIGIN = 32768  # OctoMap's: the key of the voxel whose lower corner is the map's origin
@@ -156,10 +156,8 @@ def majority(places: _I64, labels: NDArray[np.uint16]) -> tuple[_I64, _I64]:
 
 def voxel_keys(points_m: NDArray[np.floating], resolution_m: float) -> _I64:
     """Return OctoMap's keys [N] of the voxels of points [N, 3], packed; -1 where no octree reaches."""
-    with np.errstate(invalid="ignore"):
-        cells = np.floor((1.0 / resolution_m) * points_m.astype(np.float64)) + KEY_ORIGIN
-        inside = np.all((cells >= 0) & (cells < 2 * KEY_ORIGIN), axis=1)
-    a, b, c = np.where(inside[:, None], cells, 0.0).astype(np.int64).T
+    keys, inside = keys_at(points_m, resolution_m)
+    a, b, c = keys.T
     return np.where(inside, (c << (2 * _KEY_BITS)) | (b << _KEY_BITS) | a, -1)
 
 
