@@ -157,7 +157,7 @@ def test_an_lis3mdl_takes_the_range_that_is_asked_for_and_notices_lost_settings(
     with emulated_bus(bus):
         for range_ga, code in ((1.9, 0x00), (8.0, 0x20), (30.0, 0x60)):
             driver = Lis3mdl(I2cBus(bus.path, 0.02), range_ga)
-            driver.configure()
+            driver.configure(clock)
             assert bytes(chip.registers[0x20:0x25]) == bytes((0x5C, code, 0x00, 0x08, 0x40))
             clock.advance(30_000_000)
             reading = driver.read()
@@ -176,7 +176,7 @@ def test_the_fuses_of_an_ak8963_are_its_sensitivity() -> None:
     bus = EmulatedBus({0x0C: chip}, clock=clock)
     with emulated_bus(bus):
         driver = Akm(I2cBus(bus.path, 0.02), AK8963)
-        driver.configure()
+        driver.configure(clock)
         clock.advance(30_000_000)
         reading = driver.read()
         assert reading is not None

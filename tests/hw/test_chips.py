@@ -178,7 +178,7 @@ def test_each_clone_is_found_told_apart_and_measures_the_field(clock: SteppedClo
     with emulated_bus(EmulatedBus({address: virtual})) as bus:  # type: ignore[dict-item]
         chip = find_magnetometer(I2cBus(bus.path, 0.02), range_ga)
         assert chip is not None
-        chip.configure()
+        chip.configure(clock)
         readings = []
         for _ in range(50):
             pass_time(clock, 0.02)
@@ -211,7 +211,7 @@ def test_a_field_beyond_the_range_is_told(clock: SteppedClock, name: str) -> Non
     with emulated_bus(EmulatedBus({address: virtual})) as bus:  # type: ignore[dict-item]
         chip = find_magnetometer(I2cBus(bus.path, 0.02), 1.9)
         assert chip is not None
-        chip.configure()
+        chip.configure(clock)
         seen = []
         for _ in range(10):
             pass_time(clock, 0.02)
@@ -227,7 +227,7 @@ def test_hmc5883l_drops_the_measurement_that_still_has_the_old_gain(clock: Stepp
         raw_bus = I2cBus(bus.path, 0.02)
         narrow, wide = Hmc5883l(raw_bus, 0.88), Hmc5883l(raw_bus, 8.1)
         for chip in (narrow, wide, narrow):
-            chip.configure()
+            chip.configure(clock)
             seen = []
             for _ in range(4):
                 pass_time(clock, 0.0138)
@@ -247,7 +247,7 @@ def test_hmc5883l_self_test_and_the_scale_it_gives(
     virtual = VirtualHmc5883l(still, clock.now_ns, coil_ga=coil_ga)
     with emulated_bus(EmulatedBus({0x1E: virtual})) as bus:
         chip = Hmc5883l(I2cBus(bus.path, 0.02), 1.9)
-        chip.configure()
+        chip.configure(clock)
         result = chip.self_test(clock)
         assert result.passed is passed
         np.testing.assert_allclose(result.measured, np.array(coil_ga) * 390.0, atol=1.0)
@@ -260,7 +260,7 @@ def test_hmc5883l_is_freed_after_a_lock(clock: SteppedClock) -> None:
     virtual = VirtualHmc5883l(driving, clock.now_ns, SensorError(density=(0.02, 0.02, 0.02)))
     with emulated_bus(EmulatedBus({0x1E: virtual})) as bus:
         chip = Hmc5883l(I2cBus(bus.path, 0.02), 1.9)
-        chip.configure()
+        chip.configure(clock)
         readings = []
         for k in range(20):
             pass_time(clock, 0.02)
@@ -276,7 +276,7 @@ def test_magnetometers_that_lost_their_power_are_seen_at_the_next_read(clock: St
     with emulated_bus(EmulatedBus({address: virtual})) as bus:  # type: ignore[dict-item]
         chip = find_magnetometer(I2cBus(bus.path, 0.02), 1.9)
         assert chip is not None
-        chip.configure()
+        chip.configure(clock)
         pass_time(clock, 0.05)
         chip.read()
         virtual.power_cycle()  # type: ignore[attr-defined]

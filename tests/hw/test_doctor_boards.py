@@ -2,6 +2,7 @@
 
 import json
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,14 @@ import pytest
 from vislam.cli import run_verb
 from vislam.config import BoardConfig, Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
+from vislam.hw.board_check import check_board
 from vislam.hw.chips import I2cBus, identify
 from vislam.hw.chips.imus import KNOWN_IMUS
-from vislam.hw.doctor import HardwareReport, Wanted, examine
-from vislam.hw.emulator import SteppedClock, emulated_board, emulated_bus
+from vislam.hw.doctor import HardwareReport, Wanted, _listen, examine
+from vislam.hw.emulator import SteppedClock, VirtualMpu6050, emulated_board, emulated_bus
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
+from vislam.hw.emulator.fifo_board import _KINDS
+from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
 from vislam.live.sources import open_live
 from vislam.runs.record import record
@@ -114,6 +118,63 @@ def test_a_chip_that_the_kernel_owns_is_left_alone(tmp_path: Path) -> None:
     (device / "driver").symlink_to(driver)
     report = examined("LSM6DSOX", tmp_path, path="/dev/i2c-7")
     assert "echo 7-006a | sudo tee /sys/bus/i2c/drivers/st_lsm6dsx_i2c/unbind" in said(report, "error")
+
+
+def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(_KINDS, "MPU-6050", (VirtualMpu6050, 0x98, 0x68, 0.005, 400.0))
+    path = "/dev/i2c-emulated"
+    stated = said(examined("MPU-6050", tmp_path), "error")
+    assert "the chip is likely a clone of the MPU-6050 (0x98 in register 0x75)" in stated
+    assert f"vislam doctor --imu mpu6050-clone:{path}" in stated
+    assert "ITG3205" not in stated
+    clock = SteppedClock()
+    bus = emulated_board("MPU-6050", still, clock.now_ns, stepped=clock, seed=2)
+    config = BoardConfig(chip="mpu6050", bus=path)
+    with emulated_bus(bus), closing(FifoBoard(config, clock, named="mpu6050-clone")) as board:
+        findings = check_board(board, *_listen(board, 1.0, clock), path)
+    good = "\n".join(f.what for f in findings if f.severity == "ok")
+    assert "MPU-6050 clone 0x98 passes its self-test: a clone, taken for an MPU-6500; gravity is 9.8" in good
+    assert "gravity is measured as 9.8" in good
+
+
+@pytest.mark.parametrize(("gravity", "outcome"), [(4.9, "refused"), (19.6, "refused"), (9.81, "ok"), (None, "moves")])
+def test_gravity_decides_whether_the_scale_of_a_clone_fits(
+    gravity: float | None, outcome: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(_KINDS, "MPU-6050", (VirtualMpu6050, 0x98, 0x68, 0.005, 400.0))
+
+    def truth(t_ns: int):  # type: ignore[no-untyped-def]
+        force = 9.81 + 5.0 * np.sin(t_ns * 1e-8) if gravity is None else gravity
+        return (0.0, 0.0, 0.0), (0.0, 0.0, force), (20.0, 0.0, -42.0), 30.0
+
+    clock = SteppedClock()
+    with emulated_bus(emulated_board("MPU-6050", truth, clock.now_ns, stepped=clock, seed=2)):
+        if outcome == "refused":
+            with pytest.raises(
+                HardwareError, match=rf"clone 0x98 does not fit.*gravity is {gravity:.1f}.*another board"
+            ):
+                FifoBoard(BoardConfig(bus="/dev/i2c-emulated"), clock, named="mpu6050-clone")
+            return
+        with closing(FifoBoard(BoardConfig(bus="/dev/i2c-emulated"), clock, named="mpu6050-clone")) as board:
+            (test,) = board.self_tests
+            assert test.passed is (True if outcome == "ok" else None)
+            assert ("start it at rest" in test.what) == (outcome == "moves")
+
+
+@pytest.mark.parametrize("named", ["board", "lsm6dsox", "lsm6dso32"])
+def test_an_lsm6dso32_is_told_by_gravity_or_asked_for(named: str) -> None:
+    clock = SteppedClock()
+    bus = emulated_board("LSM6DSO32", still, clock.now_ns, stepped=clock, seed=2, grade="exact", magnetometer="none")
+    with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:
+        forces = [s.accel_m_s2 for s in _listen(board, 1.0, clock)[0]]
+        assert np.linalg.norm(np.mean(forces, axis=0)) == pytest.approx(9.81, abs=0.02)
+        assert board.imu is not None
+        assert board.imu.name == "LSM6DSO32"
+        assert board.imu.accel_m_s2 == pytest.approx(0.244e-3 * 9.80665), "8 g, as asked"
+        assert [test.passed for test in board.self_tests] == [True]
+    other = emulated_board("ISM330DHCX", still, clock.now_ns, stepped=clock)
+    with emulated_bus(other), pytest.raises(HardwareError, match="asked for, the chip is an ISM330DHCX"):
+        FifoBoard(BoardConfig(bus=other.path), clock, named="lsm6dso32")
 
 
 def test_names_of_a_command_line_are_families_that_there_are() -> None:

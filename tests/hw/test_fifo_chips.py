@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.core.errors import HardwareError
-from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, bmi270, icm20948, lsm6dsox, mpu6050
+from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, bmi270, icm20948, identify, lsm6dsox, mpu6050
 from vislam.hw.chips.fifo_imu import divided, next_of
+from vislam.hw.chips.imus import find_imu
 from vislam.hw.emulator import (
     EmulatedBus,
     FifoChip,
@@ -157,6 +158,35 @@ def test_what_is_written_to_an_mpu_is_what_the_register_map_says(who_am_i: int, 
             driver.temperature_c()
 
 
+@pytest.mark.parametrize("who_am_i", [0x72, 0x74, 0x78, 0x98])
+def test_a_clone_is_named_by_its_register_and_taken_as_asked(who_am_i: int) -> None:
+    words = f"0x68 is likely a clone of the MPU-6050 \\(0x{who_am_i:02x} in register 0x75\\).*--imu mpu6050-clone"
+    with alone(mpu6050.Mpu6050, VirtualMpu6050, is_configured=False, who_am_i=who_am_i) as (_, chip, bus, clock):
+        found = identify(I2cBus(bus.path, 0.02))
+        assert [(f.name, f.clone) for f in found] == [
+            (f"likely a clone of the MPU-6050 (0x{who_am_i:02x} in register 0x75)", "mpu6050-clone")
+        ]
+        for chip_name in ("auto", "mpu6050"):
+            with pytest.raises(HardwareError, match=words):
+                find_imu(I2cBus(bus.path, 0.02), SETUP, chip_name)
+        taken = find_imu(I2cBus(bus.path, 0.02), replace(SETUP, named="mpu6050-clone"))
+        taken.configure(clock)
+        assert taken.name == f"MPU-6050 clone 0x{who_am_i:02x}"
+        assert chip.registers[0x1D] == 2, "the filter that an MPU-6500 has"
+
+
+@pytest.mark.parametrize("who_am_i", [0x00, 0x19, 0xFF])
+def test_of_a_chip_that_is_none_of_its_address_each_register_is_named(who_am_i: int) -> None:
+    with alone(mpu6050.Mpu6050, VirtualMpu6050, is_configured=False, who_am_i=who_am_i) as (_, chip, bus, _):
+        chip.registers[0x00] = 0xC1
+        assert [f.name for f in identify(I2cBus(bus.path, 0.02))] == [
+            "unknown chip (0xc1 in register 0x00: no ITG3205 or ICM-20948 or BMI270; "
+            f"0x{who_am_i:02x} in register 0x75: no MPU-6050 or MPU-6500 or MPU-9250 or MPU-9255)"
+        ]
+        with pytest.raises(HardwareError, match=f"0xc1 in register 0x00; 0x68 has 0x{who_am_i:02x} in register 0x75"):
+            find_imu(I2cBus(bus.path, 0.02), replace(SETUP, named="mpu6050-clone"))
+
+
 def test_an_overflow_of_an_mpu_loses_the_boundaries_and_is_thrown_away() -> None:
     with alone(mpu6050.Mpu6050, VirtualMpu6050) as (driver, chip, _, clock):
         clock.advance(420_500_000)
@@ -240,6 +270,33 @@ def test_what_is_written_to_an_icm20948_is_in_the_right_bank() -> None:
         chip.power_cycle()
         with pytest.raises(SettingsLostError, match="401e"):
             driver.temperature_c()
+
+
+@pytest.mark.parametrize("size", [328, 8192])
+@pytest.mark.parametrize("cas", [-64, -21, 0, 63])
+def test_what_the_rate_about_z_leaks_into_x_of_a_bmi270_is_taken_off(tmp_path: Path, size: int, cas: int) -> None:
+    """`gx - cas * gz / 512`, cas in 0x1E for bmi270_maximum_fifo, else in 0x3C: Bosch's bmi2.c."""
+    file = tmp_path / "whole.bin"
+    file.write_bytes(bytes(size))
+
+    def turning(t_ns: int) -> Any:
+        return (0.1, 0.0, 2.0), (0.0, 0.0, 9.81), (20.0, 0.0, -42.0), 30.0
+
+    clock = SteppedClock()
+    chip = VirtualBmi270(turning, clock.now_ns)
+    chip.cas = cas
+    with emulated_bus(EmulatedBus({0x68: chip}, clock=clock)) as bus:
+        driver = bmi270.Bmi270(I2cBus(bus.path, 0.02), replace(SETUP, firmware=str(file)))
+        driver.configure(clock)
+        clock.advance(100_000_000)
+        raw = driver.take(driver.waiting().units)
+    np.testing.assert_allclose(raw.gyro[-1] * driver.gyro_rad_s, [0.1, 0.0, 2.0], atol=driver.gyro_rad_s)
+
+
+@pytest.mark.parametrize(("who_am_i", "value"), [(0x6C, 0xE0), (0x6B, 0xE2)])
+def test_an_ism330dhcx_gets_its_device_conf(who_am_i: int, value: int) -> None:
+    with alone(lsm6dsox.Lsm6dsox, VirtualLsm6dsox, who_am_i=who_am_i) as (_, chip, _, _):
+        assert chip.registers[0x18] == value, "CTRL9_XL: bit 1 set to 1, DS13012 section 9.19"
 
 
 @pytest.mark.parametrize("smbus_only", [False, True])

@@ -57,7 +57,7 @@ class BoardMagnetometer:
         if isinstance(found, Hmc5883l) and isinstance(self.chip, Hmc5883l):
             found.scale = self.chip.scale
         self.chip = found
-        found.configure()
+        found.configure(self._clock)
 
     def read(self, links: ChipLinks, now: int) -> MagSample | None:
         """Return a sample [uT] if one is due and new; faults go to the board's counts, events and link.

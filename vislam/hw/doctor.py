@@ -19,7 +19,7 @@ from vislam.hw.board_check import MAX_RATE_DEG_S, check_board, check_rest, check
 from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.webcam import Capture, Webcam
-from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command
+from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command, use_clone
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
 from vislam.hw.library_cameras import (
@@ -183,6 +183,9 @@ def _examine_chips(
         elif chip.is_elsewhere:
             next_step = "tie the chip's address pin (SDO or AD0) low, as on a GY-85"
             notes.add(severity, f"the {chip.name} is not at its usual address", where, next_step)
+        elif chip.clone:
+            notes.add(severity, f"the chip is {chip.name}", where, use_clone(chip.clone, bus.path))
+            return None
         else:
             found[chip.name] = chip.address
     imu = next((address for name, address in found.items() if name in IMU_NAMES), None)

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from vislam.config import BoardConfig
-from vislam.core.errors import UsageError
+from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.board_magnetometer import BoardMagnetometer
-from vislam.hw.chips import BusError, FifoImu, I2cBus, ImuSetup, SelfTest, SettingsLostError, find_imu
+from vislam.hw.chips import (
+    BusError,
+    FifoImu,
+    I2cBus,
+    ImuSetup,
+    SelfTest,
+    SettingsLostError,
+    find_imu,
+    lsm6dsox,
+    mpu6050,
+)
 from vislam.hw.chips.magnetometer import find_any_magnetometer
 from vislam.hw.fifo_samples import FifoSamples
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 from vislam.hw.link import ChipLinks, Link, refuse_shared
+from vislam.hw.scale_test import force_at_rest, scale_test
 from vislam.hw.timing import Clock, HostClock, read_in_rounds
 
 _NS = 1_000_000_000
@@ -33,20 +45,24 @@ class FifoBoard:
 
     stamped_by = "the chip's clock, from the counts of its FIFO"
 
-    def __init__(self, config: BoardConfig, clock: Clock | None = None, must_be_there: bool = True) -> None:
+    def __init__(
+        self, config: BoardConfig, clock: Clock | None = None, must_be_there: bool = True, named: str = ""
+    ) -> None:
         """Open the bus, find the chip and set it up.
 
-        With `must_be_there` False a missing board is not an error: it is looked for as after unplugging.
+        With `must_be_there` False a missing board is not an error: it is looked for as after unplugging. `named` is the
+        chip's name on the command line, by which clones and chips of one id are known. Where the id does not settle the
+        scale, gravity does, if the chip is at rest when it is first set up.
 
         Raises:
             UsageError: a rate that no such board has.
-            HardwareError: bus or chip is missing or is another chip; smbus2 is not installed.
+            HardwareError: bus or chip is missing or is another chip, or a clone of another scale; no smbus2.
         """
         if not config.rate_hz <= 1000.0:
             raise UsageError(f"board.rate_hz must be at most 1000, got {config.rate_hz:g}")
         self._config = config
         self._clock: Clock = HostClock() if clock is None else clock
-        self._setup = ImuSetup(config.rate_hz, config.gyro_range_deg_s, config.accel_range_g, config.firmware)
+        self._setup = ImuSetup(config.rate_hz, config.gyro_range_deg_s, config.accel_range_g, config.firmware, named)
         self.rate_hz = config.rate_hz
         self.self_tests: tuple[SelfTest, ...] = ()
         self._imu: FifoImu | None = None
@@ -174,12 +190,27 @@ class FifoBoard:
 
     # ---- coming and going -------------------------------------------------------------------------------------
 
-    def _start_imu(self, bus: I2cBus) -> None:
+    def _set_up(self, bus: I2cBus) -> FifoImu:
         imu = find_imu(bus, self._setup, self._config.chip, self._config.address)
         refuse_shared(bus, imu.address)
         imu.configure(self._clock)
+        return imu
+
+    def _start_imu(self, bus: I2cBus) -> None:
+        imu = self._set_up(bus)
+        is_tested = bool(imu.doubt) and not self.self_tests
+        if is_tested:
+            force = force_at_rest(imu, self._clock)
+            is_asked = self._setup.named in (lsm6dsox.TWIN, mpu6050.CLONE)
+            if force is not None and not is_asked and scale_test(imu, 2.0 * force).passed:
+                self._setup, force = replace(self._setup, named=lsm6dsox.TWIN), 2.0 * force
+                imu = self._set_up(bus)
+            test = scale_test(imu, force)
+            if test.passed is False and is_asked:
+                raise HardwareError(f"{bus.path}: the {imu.name} does not fit: {test.what}; use another board")
+            self.self_tests = (test,)
         self._samples.begin(imu, self._clock.now_ns() + round(imu.start_up_s * _NS))
-        self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, False
+        self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, is_tested
         if self._config.mag is None and not self._mag.link.is_wanted:
             with suppress(BusError):  # one that is on the board answers now: what is inside the chip is on the bus
                 self._mag.link.is_wanted = find_any_magnetometer(bus, self._config.mag_range_ga) is not None

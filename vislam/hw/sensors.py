@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 CHIPS: dict[str, ImuChip | None] = {
     "board": None, "lsm6dsox": "lsm6dsox", "lsm6dso": "lsm6dsox", "ism330dhcx": "lsm6dsox",
     "mpu6050": "mpu6050", "mpu6500": "mpu6050", "mpu9250": "mpu6050", "icm20948": "icm20948", "bmi270": "bmi270",
+    "mpu6050-clone": "mpu6050", "lsm6dso32": "lsm6dsox",
 }  # fmt: skip
 INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial", *WITH_IMU)
 
@@ -55,7 +56,7 @@ def open_inertial(
     if kind in CHIPS:
         from vislam.hw.fifo_board import FifoBoard
 
-        return FifoBoard(_board(kind, where, config), must_be_there=must_be_there)
+        return FifoBoard(_board(kind, where, config), must_be_there=must_be_there, named=kind)
     if kind in ("bno085", "adafruit"):
         from vislam.hw.adafruit import BNO085, open_adafruit
 

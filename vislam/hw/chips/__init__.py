@@ -6,7 +6,7 @@ from vislam.hw.chips.field import Magnetometer
 from vislam.hw.chips.fifo_imu import FifoImu, ImuSetup
 from vislam.hw.chips.hmc5883l import Hmc5883l
 from vislam.hw.chips.ids import IMU_NAMES, identify
-from vislam.hw.chips.imus import find_imu
+from vislam.hw.chips.imus import find_imu, use_clone
 from vislam.hw.chips.itg3205 import Itg3205
 from vislam.hw.chips.magnetometer import find_magnetometer
 from vislam.hw.chips.self_test import SelfTest
@@ -28,4 +28,5 @@ __all__ = [
     "identify",
     "kernel_driver",
     "unbind_command",
+    "use_clone",
 ]

@@ -23,6 +23,7 @@ ADDRESS = 0x0C
 _UT_PER_LSB = 0.15
 _READY, _OVERFLOW = 0x01, 0x08
 _DOWN, _FUSES = 0x00, 0x0F
+_DOWN_S = 0.0001  # in power-down before another mode, section 9.3 of AK09916's and 6.3 of AK8963's data sheet
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +56,20 @@ class Akm:
         self._reads = bus.prepare([(ADDRESS, variant.control, 1), (ADDRESS, variant.status, variant.length)])
         self._scale: Array = np.ones(3)
 
-    def configure(self) -> None:
+    def configure(self, clock: Clock) -> None:
         """Read the sensitivity where the chip keeps one, start measuring; raises BusError."""
         v = self._variant
-        self._bus.write(ADDRESS, v.control, _DOWN)  # between any two modes
+        self._power_down(clock)
         if v.fuses is not None:
             self._bus.write(ADDRESS, v.control, _FUSES)
             fuses = np.frombuffer(self._bus.read(ADDRESS, v.fuses, 3), dtype=np.uint8)
             self._scale = 1.0 + (fuses.astype(np.float64) - 128.0) / 256.0
-            self._bus.write(ADDRESS, v.control, _DOWN)
+            self._power_down(clock)
         self._bus.write(ADDRESS, v.control, v.continuous_100_hz)
+
+    def _power_down(self, clock: Clock) -> None:
+        self._bus.write(ADDRESS, self._variant.control, _DOWN)
+        clock.sleep_until(clock.now_ns() + round(_DOWN_S * 1e9))
 
     def read(self) -> FieldReading | None:
         """Return a new measurement, None if there is none yet; never waits. Raises BusError, SettingsLostError."""

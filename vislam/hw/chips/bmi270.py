@@ -1,6 +1,6 @@
 """The BMI270 of Bosch: needs a configuration at every start, then a FIFO of frames without headers.
 
-Registers and the order of the start by the data sheet BST-BMI270-DS000 (sections 4.4, 4.8 and 5.2), compared with
+Registers and the order of the start by the data sheet BST-BMI270-DS000 (sections 4.4, 4.6, 4.8 and 5.2), compared with
 ArduPilot's and Bosch's own drivers. The configuration is Bosch's, under the BSD licence of its driver; it is not part
 of vislam: the user names its file.
 """
@@ -24,6 +24,7 @@ FRAME_BYTES, FIFO_BYTES = 12, 2048
 
 _INT_STATUS_1, _INTERNAL_STATUS, _TEMPERATURE, _FIFO_LENGTH, _FIFO_DATA = 0x1D, 0x21, 0x22, 0x24, 0x26
 _ACC_CONF, _FIFO_CONFIG_0, _INIT_CTRL, _INIT_ADDR, _INIT_DATA = 0x40, 0x48, 0x59, 0x5B, 0x5E
+_FEATURE_PAGE, _CAS, _SMALL_CAS = 0x2F, 0x3C, 0x1E  # of gyro x to z: in page 0, and of bmi270_maximum_fifo
 _PWR_CONF, _PWR_CTRL, _CMD = 0x7C, 0x7D, 0x7E
 _RATES = {25: 0x06, 50: 0x07, 100: 0x08, 200: 0x09, 400: 0x0A, 800: 0x0B}
 _GYRO_RANGES = {250: 3, 500: 2, 1000: 1, 2000: 0}
@@ -33,6 +34,7 @@ _SOFT_RESET, _FLUSH = 0xB6, 0xB0
 _WITHOUT_HEADERS, _ALL_ON, _FULL, _STARTED = 0xC0, 0x0E, 0x01, 0x01
 _RESET_S, _WAKE_S, _START_S, _START_ASKED = 0.002, 0.0005, 0.01, 15
 _CHUNK = 32  # bytes in one message: as much as adapters without combined messages take
+_SMALL_BYTES = 1024  # bmi270_maximum_fifo has 328, the configurations with features 8192
 _MOST_FILE_BYTES, _MOST_BYTES = 1 << 20, 8192
 _ARRAY = re.compile(r"config_file\[\w*\]\s*=\s*\{([^}]*)\}")
 _HELP = "Bosch's driver on GitHub (BMI270_SensorAPI) has it: name bmi270_maximum_fifo.c or bmi270.c in board.firmware"
@@ -46,6 +48,7 @@ class Bmi270:
     """
 
     start_up_s = 0.1
+    doubt = ""
     max_zero_deg_s = 1.0
 
     def __init__(self, bus: I2cBus, setup: ImuSetup, address: int = ADDRESSES[0]) -> None:
@@ -65,6 +68,7 @@ class Bmi270:
         self._count = bus.prepare([(address, _INT_STATUS_1, 1), (address, _FIFO_LENGTH, 2)])
         self._pops = bus.prepare([(address, _FIFO_DATA, FRAME_BYTES)] * MAX_READS)
         self._watch = bus.prepare([(address, _ACC_CONF, 4), (address, _TEMPERATURE, 2)])
+        self._cross = 0.0  # of the rate about z that shows in that about x
 
     def configure(self, clock: Clock) -> None:
         """Reset the chip, send its configuration, set it up, start it with an empty FIFO: 0.3 s at most at 400 kHz.
@@ -86,12 +90,21 @@ class Bmi270:
             raise HardwareError(
                 f"{self._bus.path}: the {self.name} does not take its configuration (status {status}); {_HELP}"
             )
+        self._cross = self._read_cross()
         for offset, value in enumerate(self._settings):
             self._bus.write(self.address, _ACC_CONF + offset, value)
         for offset, value in enumerate((0, _WITHOUT_HEADERS)):  # the oldest frames are overwritten
             self._bus.write(self.address, _FIFO_CONFIG_0 + offset, value)
         self._bus.write(self.address, _PWR_CTRL, _ALL_ON)
         self.empty()
+
+    def _read_cross(self) -> float:
+        """Return the chip's factor_zx, seven bits with sign of 2**-9, as Bosch's driver finds it."""
+        is_small = len(self._configuration) <= _SMALL_BYTES
+        if not is_small:
+            self._bus.write(self.address, _FEATURE_PAGE, 0)
+        found = self._bus.read(self.address, _SMALL_CAS if is_small else _CAS, 1)[0] & 0x7F
+        return (found - 128 if found & 0x40 else found) / 512.0
 
     def _send(self) -> None:
         self._bus.write(self.address, _INIT_CTRL, 0)
@@ -116,7 +129,8 @@ class Bmi270:
         if not data:
             return NO_SAMPLES
         counts = np.frombuffer(data, dtype="<i2").reshape(-1, 6).astype(np.float64)
-        return RawSamples(counts[:, :3], counts[:, 3:])
+        gyro = counts[:, :3] - self._cross * counts[:, 2:3] * np.array([1.0, 0.0, 0.0])
+        return RawSamples(gyro, counts[:, 3:])
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""

@@ -24,7 +24,7 @@ class Magnetometer(Protocol):
     name: str
     rate_hz: float
 
-    def configure(self) -> None:
+    def configure(self, clock: Clock) -> None:
         """Start measuring; raises BusError."""
         ...
 

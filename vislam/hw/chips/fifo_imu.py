@@ -24,6 +24,7 @@ class ImuSetup:
     gyro_range_deg_s: int
     accel_range_g: int
     firmware: str | None = None  # file that the chip needs at every start
+    named: str = ""  # as a command line names it: of chips with one id, and of clones, only the user knows which it is
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,7 @@ class FifoImu(Protocol):
         accel_delay_s: by which the accelerometer's is.
         start_up_s: after `configure` until its samples are good.
         max_zero_deg_s: of the gyro at rest, by the data sheet.
+        doubt: why the id does not settle the scale; empty: it does.
     """
 
     name: str
@@ -72,6 +74,7 @@ class FifoImu(Protocol):
     accel_delay_s: float
     start_up_s: float
     max_zero_deg_s: float
+    doubt: str
 
     def configure(self, clock: Clock) -> None:
         """Reset the chip, set it up and start it with an empty FIFO; raises BusError, HardwareError."""

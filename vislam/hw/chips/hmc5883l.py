@@ -57,7 +57,7 @@ class Hmc5883l:
         self._to_drop = 0
         self._silent = 0
 
-    def configure(self) -> None:
+    def configure(self, clock: Clock) -> None:
         """Start measuring; raises BusError."""
         self._set(_RATE_75_HZ | _AVERAGE_1, self._code)
 
@@ -98,7 +98,7 @@ class Hmc5883l:
                     x, z, y = struct.unpack_from(">3h", self._reads.run(), 4)
                 answers.append(np.array([x, y, z], dtype=np.float64))
         finally:
-            self.configure()
+            self.configure(clock)
         low, high = _SELF_TEST_LSB
         signed = [answers[0], -answers[1]]
         passed = all(bool(((values >= low) & (values <= high)).all()) for values in signed)

@@ -44,6 +44,7 @@ class Icm20948:
     """
 
     start_up_s = 0.1
+    doubt = ""
     max_zero_deg_s = 5.0
 
     def __init__(self, bus: I2cBus, setup: ImuSetup, address: int = ADDRESSES[0]) -> None:

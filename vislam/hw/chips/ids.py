@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from vislam.hw.chips import adxl345, akm, hmc5883l, itg3205, lis3mdl
 from vislam.hw.chips.bus import BusError, I2cBus
-from vislam.hw.chips.imus import KNOWN_IMUS
+from vislam.hw.chips.imus import KNOWN_IMUS, KnownImu
 from vislam.hw.chips.qmc5883 import QMC5883L, QMC5883P
 
 
@@ -17,7 +17,8 @@ class FoundChip:
 
     name: str
     address: int
-    is_elsewhere: bool  # at the address that it has with its address pin tied the other way
+    is_elsewhere: bool = False  # at the address that it has with its address pin tied the other way
+    clone: str = ""  # the name with which a command line takes it, if it is a likely clone
 
 
 _ASKED_TIMES = 3  # a chip that does not answer may have been disturbed
@@ -31,6 +32,7 @@ class _Candidate:
     register: int
     names: dict[bytes, str]  # by what is in the register
     is_elsewhere: bool = False
+    imu: KnownImu | None = None
 
 
 _ITG3205 = {b"\x68": "ITG3205", b"\x69": "ITG3205"}
@@ -43,7 +45,7 @@ _KNOWN = (
     _Candidate(hmc5883l.ADDRESS, hmc5883l.ID_REGISTER, {hmc5883l.IDS: "HMC5883L or DA5883"}),
     *(_Candidate(v.address, v.id_register, {bytes([v.id_value]): v.name}) for v in (QMC5883L, QMC5883P)),
     *(
-        _Candidate(address, known.id_register, {bytes([value]): name for value, name in known.ids.items()})
+        _Candidate(address, known.id_register, {bytes([value]): name for value, name in known.ids.items()}, imu=known)
         for known in KNOWN_IMUS
         for address in known.addresses
     ),
@@ -64,15 +66,20 @@ def identify(bus: I2cBus) -> list[FoundChip]:
 
 
 def _named(bus: I2cBus, candidates: list[_Candidate]) -> FoundChip:
-    """Return the first candidate that the chip at their address is; unknown: what it answered to the first."""
-    first = b""
-    for candidate in candidates:
-        answer = _asked(bus, candidate)
-        first = first or answer
+    """Return the first candidate that the chip at their address is; unknown: what it answered to each of them."""
+    answers = [(candidate, _asked(bus, candidate)) for candidate in candidates]
+    for candidate, answer in answers:
         if answer in candidate.names:
             return FoundChip(candidate.names[answer], candidate.address, candidate.is_elsewhere)
-    likely = next(iter(candidates[0].names.values()))
-    return FoundChip(f"unknown chip (id {first.hex()}, not a {likely})", candidates[0].address, False)
+    for candidate, answer in answers:
+        if candidate.imu is not None and candidate.imu.cloned(answer[0]):
+            return FoundChip(candidate.imu.cloned(answer[0]), candidate.address, clone=candidate.imu.clone)
+    said: dict[str, list[str]] = {}
+    for candidate, answer in answers:
+        read = f"0x{answer.hex()} in register 0x{candidate.register:02x}"
+        said.setdefault(read, []).extend(dict.fromkeys(candidate.names.values()))
+    words = "; ".join(f"{read}: no {' or '.join(names)}" for read, names in said.items())
+    return FoundChip(f"unknown chip ({words})", candidates[0].address)
 
 
 def _asked(bus: I2cBus, candidate: _Candidate) -> bytes:

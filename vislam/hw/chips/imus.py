@@ -22,14 +22,31 @@ class KnownImu:
     id_register: int
     ids: dict[int, str]  # value of that register -> name of the chip
     make: Callable[[I2cBus, ImuSetup, int], FifoImu]
+    clone: str = ""  # the name with which a command line takes a clone
+    clone_ids: frozenset[int] = frozenset()  # seen on boards that are sold as the first of `ids`
+
+    def cloned(self, found: int) -> str:
+        """Return what a chip of this id is likely to be, in words; empty: no clone."""
+        if found not in self.clone_ids:
+            return ""
+        likely = next(iter(self.ids.values()))
+        return f"likely a clone of the {likely} (0x{found:02x} in register 0x{self.id_register:02x})"
 
 
+# fmt: off
 KNOWN_IMUS = (
     KnownImu("lsm6dsox", lsm6dsox.ADDRESSES, lsm6dsox.ID_REGISTER, lsm6dsox.IDS, lsm6dsox.Lsm6dsox),
     KnownImu("icm20948", icm20948.ADDRESSES, icm20948.ID_REGISTER, icm20948.IDS, icm20948.Icm20948),
     KnownImu("bmi270", bmi270.ADDRESSES, bmi270.ID_REGISTER, bmi270.IDS, bmi270.Bmi270),
-    KnownImu("mpu6050", mpu6050.ADDRESSES, mpu6050.ID_REGISTER, mpu6050.IDS, mpu6050.Mpu6050),
+    KnownImu("mpu6050", mpu6050.ADDRESSES, mpu6050.ID_REGISTER, mpu6050.IDS, mpu6050.Mpu6050,
+             mpu6050.CLONE, mpu6050.CLONE_IDS),
 )
+# fmt: on
+
+
+def use_clone(clone: str, path: str) -> str:
+    """Return how a clone is tried and taken."""
+    return f"at rest, `vislam doctor --imu {clone}:{path}` measures whether its scale fits; then use it as {clone}"
 
 
 def find_imu(bus: I2cBus, setup: ImuSetup, chip: str = "auto", address: int | None = None) -> FifoImu:
@@ -41,9 +58,10 @@ def find_imu(bus: I2cBus, setup: ImuSetup, chip: str = "auto", address: int | No
         chip: family to look for, `auto`: any.
         address: where to look only; None: wherever such chips can be.
 
-    Raises HardwareError: none is there, and what is in its place; BusError.
+    A clone is one of these that `setup.named` asks for. Raises HardwareError: none is there, and what is in its place;
+    BusError.
     """
-    others, asked = [], []
+    others, asked, clone = [], [], ""
     for known in KNOWN_IMUS:
         if chip not in ("auto", known.chip):
             continue
@@ -52,12 +70,16 @@ def find_imu(bus: I2cBus, setup: ImuSetup, chip: str = "auto", address: int | No
             if not bus.answers(place, known.id_register, _ASKED_TIMES):
                 continue
             found = bus.read(place, known.id_register, 1)[0]
-            if found in known.ids:
+            if found in known.ids or (known.cloned(found) and setup.named == known.clone):
                 return known.make(bus, setup, place)
+            if known.cloned(found):
+                clone = f"the chip at 0x{place:02x} is {known.cloned(found)}; {use_clone(known.clone, bus.path)}"
             others.append(f"0x{place:02x} has 0x{found:02x} in register 0x{known.id_register:02x}")
+    if clone:
+        raise HardwareError(f"{bus.path}: {clone}")
     places = ", ".join(f"0x{place:02x}" for place in sorted(set(asked)))
     what = "no inertial chip with a FIFO" if chip == "auto" else f"no {chip}"
-    strangers = f" ({'; '.join(others)})" if others else ""
+    strangers = f" ({'; '.join(dict.fromkeys(others))})" if others else ""
     raise HardwareError(
         f"{bus.path}: {what} answers at {places}{strangers}; check power, ground, SDA and SCL, `vislam doctor` lists "
         "what answers"

@@ -38,7 +38,7 @@ class Lis3mdl:
         # settings and data in one go: a chip that lost its power for a moment is seen at once
         self._reads = bus.prepare([(address, _CTRL_REG1 | _INCREMENT, 5), (address, _STATUS | _INCREMENT, 7)])
 
-    def configure(self) -> None:
+    def configure(self, clock: Clock) -> None:
         """Start measuring; raises BusError."""
         for offset, value in enumerate(self._settings):
             self._bus.write(self._address, _CTRL_REG1 + offset, value)

@@ -18,7 +18,9 @@ from vislam.hw.timing import Clock
 
 ADDRESSES = (0x6A, 0x6B)
 ID_REGISTER = 0x0F
-IDS = {0x6C: "LSM6DSOX", 0x6B: "ISM330DHCX"}  # an LSM6DSO has 0x6C, too, and is alike in all that is used here
+# an LSM6DSO has 0x6C, too, and is alike in all that is used here; so has an LSM6DSO32, with twice the range (DS13180)
+IDS = {0x6C: "LSM6DSOX", 0x6B: "ISM330DHCX"}
+TWIN = "lsm6dso32"
 
 _FIFO_CTRL1, _FIFO_CTRL4, _CTRL1_XL, _CTRL3_C, _TEMPERATURE = 0x07, 0x0A, 0x10, 0x12, 0x20
 _FIFO_STATUS1, _FREQ_FINE, _FIFO_TAG = 0x3A, 0x63, 0x78
@@ -33,6 +35,8 @@ _RESET, _BLOCK_UPDATE, _INCREMENT = 0x01, 0x40, 0x04
 _CONTINUOUS, _OVERRUN = 0x06, 0x08
 _RESET_S, _RESET_ASKED = 0.001, 50
 _FREQ_STEP = 0.0015
+_SHARED_ID, _ISM330DHCX_ID = 0x6C, 0x6B
+_CTRL9_XL, _DEVICE_CONF = 0x18, 0xE2  # with what it has after a reset
 GYRO, ACCEL = 0x01, 0x02  # sensors as tags name them
 WORD_BYTES, FIFO_WORDS = 7, 512
 
@@ -52,10 +56,12 @@ class Lsm6dsox:
         self._bus, self.address = bus, address
         self.name = IDS[0x6C]
         self._code = _RATES[next_of(setup.rate_hz, _RATES)]
-        gyro, accel = next_of(setup.gyro_range_deg_s, _GYRO_RANGES), next_of(setup.accel_range_g, _ACCEL_RANGES)
+        self._is_twin, self.doubt = setup.named == TWIN, ""
+        twice = 2 if self._is_twin else 1
+        gyro, accel = next_of(setup.gyro_range_deg_s, _GYRO_RANGES), next_of(setup.accel_range_g / twice, _ACCEL_RANGES)
         self.rate_hz = _NOMINAL_HZ / _HALVINGS[self._code]
         self.gyro_rad_s = float(np.deg2rad(1e-3 * _GYRO_MDEG_S[gyro]))
-        self.accel_m_s2 = 1e-3 * _ACCEL_MG[accel] * G_M_S2
+        self.accel_m_s2 = 1e-3 * twice * _ACCEL_MG[accel] * G_M_S2
         self.gyro_delay_s, self.accel_delay_s = 0.225 * 3.0 / self.rate_hz, 0.225 * 2.0 / self.rate_hz
         self._settings = bytes((self._code << 4 | _ACCEL_RANGES[accel] << 2, self._code << 4 | _GYRO_RANGES[gyro] << 2))
         self._count = bus.prepare([(address, _FIFO_STATUS1, 2)])
@@ -68,6 +74,13 @@ class Lsm6dsox:
         """Reset the chip, set it up and start it with an empty FIFO; raises BusError, HardwareError."""
         found = self._bus.read(self.address, ID_REGISTER, 1)[0]
         self.name = refuse_other(self._bus, self.address, found, IDS)
+        if found == _SHARED_ID:
+            self.name = TWIN.upper() if self._is_twin else self.name
+            self.doubt = "an LSM6DSOX and an LSM6DSO32 have one id"
+        elif self._is_twin:
+            raise HardwareError(
+                f"{self._bus.path}: an {TWIN.upper()} is asked for, the chip is an {self.name}; name that"
+            )
         self._bus.write(self.address, _CTRL3_C, _RESET)
         for _ in range(_RESET_ASKED):
             clock.sleep_until(clock.now_ns() + round(_RESET_S * 1e9))
@@ -78,6 +91,8 @@ class Lsm6dsox:
         error = self._bus.read(self.address, _FREQ_FINE, 1)[0]
         fine = error - 256 if error > 127 else error
         self.rate_hz = _NOMINAL_HZ * (1.0 + _FREQ_STEP * fine) / _HALVINGS[self._code]
+        if found == _ISM330DHCX_ID:
+            self._bus.write(self.address, _CTRL9_XL, _DEVICE_CONF)  # "set to 1": DS13012, 9.19, and ST's examples
         self._bus.write(self.address, _CTRL3_C, _BLOCK_UPDATE | _INCREMENT)
         for offset, value in enumerate((0, 0, self._code << 4 | self._code)):  # no watermark; both are batched
             self._bus.write(self.address, _FIFO_CTRL1 + offset, value)

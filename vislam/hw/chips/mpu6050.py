@@ -27,6 +27,9 @@ from vislam.hw.timing import Clock
 ADDRESSES = (0x68, 0x69)
 ID_REGISTER = 0x75
 IDS = {0x68: "MPU-6050", 0x70: "MPU-6500", 0x71: "MPU-9250", 0x73: "MPU-9255"}
+# MPU-6515, MPU-6880, ICM-20689 and what is sold as an MPU-6050 or MPU-9250 with their ids: like an MPU-6500 where known
+CLONE = "mpu6050-clone"  # its name on a command line
+CLONE_IDS = frozenset((0x72, 0x74, 0x78, 0x98))
 SAMPLE_BYTES = 12
 
 _SMPLRT_DIV, _FIFO_EN, _INT_PIN_CFG, _INT_ENABLE, _INT_STATUS, _TEMPERATURE = 0x19, 0x23, 0x37, 0x38, 0x3A, 0x41
@@ -60,6 +63,7 @@ class Mpu6050:
         accel_g = next_of(setup.accel_range_g, _ACCEL_RANGES)
         self.gyro_rad_s = float(np.deg2rad(1.0 / _LSB_PER_DEG_S[gyro]))
         self.accel_m_s2 = accel_g / 32768.0 * G_M_S2
+        self._is_clone_taken, self.doubt = setup.named == CLONE, ""
         self._settings = bytes((self._divider - 1, _FILTER, gyro << 3, _ACCEL_RANGES[accel_g] << 3))
         self._take_id(0x68)
         self._count = bus.prepare([(address, _INT_STATUS, 1), (address, _FIFO_COUNT, 2)])
@@ -67,7 +71,10 @@ class Mpu6050:
         self._watch = bus.prepare([(address, _SMPLRT_DIV, 4), (address, _TEMPERATURE, 2)])
 
     def _take_id(self, found: int) -> None:
-        self.name = refuse_other(self._bus, self.address, found, IDS)
+        if found in CLONE_IDS and self._is_clone_taken:
+            self.name, self.doubt = f"MPU-6050 clone 0x{found:02x}", "a clone, taken for an MPU-6500"
+        else:
+            self.name = refuse_other(self._bus, self.address, found, IDS)
         self._is_first = found == 0x68
         self._fifo_bytes = 1024 if self._is_first else 512
         self.gyro_delay_s, self.accel_delay_s = _DELAYS_S.get(found, _LATER_DELAYS_S)

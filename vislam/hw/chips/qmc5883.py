@@ -64,7 +64,7 @@ class Qmc5883:
         )
         self.name = variant.name
 
-    def configure(self) -> None:
+    def configure(self, clock: Clock) -> None:
         """Start measuring; raises BusError."""
         for register, value in self._setup:
             self._bus.write(self._variant.address, register, value)

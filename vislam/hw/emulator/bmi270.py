@@ -15,6 +15,7 @@ class VirtualBmi270(FifoChip):
     Attributes:
         given: the configuration that it was sent.
         takes: whether it is content with that.
+        cas: 512 times what of the rate about z shows in that about x; its register has it once the chip has started.
     """
 
     FIFO_REGISTER = 0x26
@@ -22,6 +23,7 @@ class VirtualBmi270(FifoChip):
     IDENTITY = (0x00, 0x24)
     CLEARED_BY_READING = 0x1D
     takes = True
+    cas = -21
 
     def power_cycle(self) -> None:
         """Come up in advanced power save without a configuration."""
@@ -59,6 +61,7 @@ class VirtualBmi270(FifoChip):
         if register == 0x59 and value == 1:
             is_awake = not self.registers[0x7C] & 0x01
             self.registers[0x21] = 0x01 if self.takes and is_awake and self.given else 0x02
+            self.registers[0x1E if len(self.given) < 1024 else 0x3C] = self.cas & 0x7F
         runs = self.registers[0x21] == 0x01 and self.registers[0x7D] & 0x06 == 0x06 and self.registers[0x49] == 0xC0
         begins = register in (0x7D, 0x49, 0x42)
         self._pace(runs, begins)
@@ -68,7 +71,8 @@ class VirtualBmi270(FifoChip):
     def _packed(self, t_ns: int) -> bytes:
         gyro_lsb = 32768.0 / (2000.0 / (1 << (self.registers[0x43] & 7)))
         gyro, accel = self._counts(t_ns, gyro_lsb, 16384.0 / (1 << (self.registers[0x41] & 3)))
-        return struct.pack("<6h", *gyro, *accel)
+        leaked = min(max(gyro[0] + round(self.cas * gyro[2] / 512), -32768), 32767)
+        return struct.pack("<6h", leaked, *gyro[1:], *accel)
 
     def _overran(self) -> None:
         self.registers[0x1D] |= 0x01

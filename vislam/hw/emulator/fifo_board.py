@@ -12,13 +12,13 @@ from vislam.hw.emulator.bmi270 import VirtualBmi270
 from vislam.hw.emulator.bus import EmulatedBus
 from vislam.hw.emulator.chips import Chip, NowNs
 from vislam.hw.emulator.icm20948 import VirtualIcm20948
-from vislam.hw.emulator.lsm6dsox import VirtualLsm6dsox
+from vislam.hw.emulator.lsm6dsox import VirtualLsm6dso32, VirtualLsm6dsox
 from vislam.hw.emulator.magnetometers import VirtualAkm, VirtualLis3mdl, VirtualQmc5883
 from vislam.hw.emulator.mpu6050 import VirtualMpu6050
 from vislam.hw.emulator.sensing import IDEAL, SensorError, Truth
 from vislam.hw.emulator.stepped_clock import SteppedClock
 
-FifoKind = Literal["LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-6500", "MPU-9250", "ICM-20948", "BMI270"]
+FifoKind = Literal["LSM6DSOX", "LSM6DSO32", "ISM330DHCX", "MPU-6050", "MPU-6500", "MPU-9250", "ICM-20948", "BMI270"]
 BoardMagnetometer = Literal["inside", "LIS3MDL", "QMC5883P", "none"]
 _DEG = np.pi / 180.0
 _ALIKE = SensorCalibration()
@@ -26,6 +26,7 @@ _Kind = VirtualLsm6dsox | VirtualMpu6050 | VirtualIcm20948 | VirtualBmi270
 # kind -> class, id, address, and noise densities of the data sheets: deg/s/sqrt(Hz), 1e-6 g/sqrt(Hz)
 _KINDS: dict[str, tuple[type[_Kind], int, int, float, float]] = {
     "LSM6DSOX": (VirtualLsm6dsox, 0x6C, 0x6A, 0.0038, 110.0),
+    "LSM6DSO32": (VirtualLsm6dso32, 0x6C, 0x6A, 0.0038, 110.0),
     "ISM330DHCX": (VirtualLsm6dsox, 0x6B, 0x6A, 0.005, 80.0),
     "MPU-6050": (VirtualMpu6050, 0x68, 0x68, 0.005, 400.0),
     "MPU-6500": (VirtualMpu6050, 0x70, 0x68, 0.01, 300.0),

@@ -97,3 +97,9 @@ class VirtualLsm6dsox(FifoChip):
 
     def _next(self, pointer: int) -> int:
         return _TAG if pointer == _DATA_END else (pointer + 1) & 0xFF
+
+
+class VirtualLsm6dso32(VirtualLsm6dsox):
+    """The same id, and twice the ranges of acceleration."""
+
+    _ACCEL_MG = (0.122, 0.976, 0.244, 0.488)

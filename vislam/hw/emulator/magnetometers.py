@@ -236,10 +236,16 @@ class VirtualAkm(_Sampling):
         if not self._is_8963:
             self.registers[0x01] = 0x09
         self._is_held = False
+        self._down_ns = -1_000_000
         self._begin()
 
     def _write_register(self, register: int, value: int) -> None:
         if register == self._control:
+            now = self._now_ns()
+            if value == 0:
+                self._down_ns = now
+            elif now - self._down_ns < 100_000:
+                return  # it is not ready for another mode
             self.registers[register] = value
             self._is_held = False
             self._begin()
