@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -218,6 +219,61 @@ def test_a_restarted_board_gets_a_new_clock_at_once(config: SerialConfig, board:
     assert counts.get("frames_lost", 0) < 300  # what was before the restart is not missing
     assert Health.CLOCK_STEP in word
     assert (np.diff([sample.t_ns for sample in imu(samples)]) > 0).all()
+
+
+HELLO = protocol.Hello(
+    10295, 20_000_000, protocol.Chips(7), 0xE5, 0x69, b"H43", 400,
+    38307227, 1214142, 91743, 3571429, 82143, 4095, 28750, 2048,
+)  # fmt: skip
+
+
+def raw(sequence: int, t_us: int, n: int = 0, **other: Any) -> protocol.RawSample:
+    rest = {"status": protocol.Status(0), "mag": (200, -400, 8), "temperature": -13200}
+    return protocol.RawSample(sequence, t_us, accel=(n, 2, 256), gyro=(n, 2, 3), **{**rest, **other})
+
+
+@pytest.fixture
+def unopened() -> SerialBridge:
+    return SerialBridge(SerialConfig(port="/dev/absent"), must_be_there=False)
+
+
+@pytest.mark.parametrize("up_us", [20_000_000, 3_000_000_000])
+def test_what_a_restarted_board_sends_before_its_hello_is_not_lost(unopened: SerialBridge, up_us: int) -> None:
+    started = replace(HELLO, sequence=2, t_us=303_000, chips=protocol.Chips(7) | protocol.Chips.STARTED)
+    for message, arrival_ms, lost in (
+        (replace(HELLO, t_us=up_us), 1000, 0),
+        (raw(10296, up_us + 2500), 1002, 0),
+        (raw(10299, up_us + 10_000), 1010, 2),
+        (raw(0, 300_000), 3010, 2),
+        (raw(1, 302_500), 3012, 2),
+        (started, 3013, 2),
+        (raw(4, 307_500), 3017, 3),
+    ):
+        unopened._taken(message, arrival_ms * 1_000_000)
+        assert unopened.counters().get("frames_lost", 0) == lost
+    assert unopened.counters()["device_restarts"] == 1
+
+
+def test_frames_lost_while_the_host_was_put_aside_are_counted(unopened: SerialBridge) -> None:
+    for message, arrival_ms in ((HELLO, 1000), (raw(10296, 20_002_500), 9000), (raw(13796, 28_002_500), 9000)):
+        unopened._taken(message, arrival_ms * 1_000_000)
+    assert unopened.counters()["frames_lost"] == 3499
+
+
+def test_a_magnetometer_that_gives_the_same_for_ever_is_named_and_not_used(unopened: SerialBridge) -> None:
+    unopened._taken(HELLO, 1_000_000_000)
+    fields = {False: 0, True: 0}
+    for n in range(1000):
+        status = protocol.Status.MAG_NEW if n % 8 == 0 else protocol.Status(0)
+        field = (n % 512, -400, 8) if n < 800 else (2, -400, 8)
+        message = raw(10296 + n, 20_000_000 + 2500 * (n + 1), n, status=status, mag=field)
+        found = unopened._taken(message, 1_000_000_000 + 2_500_000 * (n + 1))
+        fields[n >= 900] += sum(isinstance(sample, MagSample) for sample in found)
+        if n in (799, 900):
+            assert bool(unopened.health() & Health.MAG_FAULT) == (n == 900), "named within 0.25 s"
+    assert fields[False] > 0
+    assert fields[True] == 0
+    assert unopened.counters()["mag_stuck"] > 0
 
 
 def test_a_host_that_was_busy_stamps_as_if_it_had_not_been(config: SerialConfig, board: BridgeEmulator) -> None:

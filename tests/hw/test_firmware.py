@@ -53,7 +53,8 @@ def compiled(folder: Path, *told: str) -> Path:
         missing("no C++ compiler for the sketch")
     program = folder / "bridge"
     sources = ["-I", FAKE, "-I", SKETCH, FAKE / "main.cpp", "-o", program]
-    strict = ["-std=c++11", "-Wall", "-Wextra", "-Wconversion", "-Wno-psabi", "-Werror=return-type", "-O1"]
+    core = [] if "-DESP32" in told else ["-DARDUINO_ARCH_AVR"]
+    strict = [*core, "-std=c++11", "-Wall", "-Wextra", "-Wconversion", "-Wno-psabi", "-Werror=return-type", "-O1"]
     result = subprocess.run([compiler, *strict, *told, *sources], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "vislam_bridge.ino" not in result.stderr, result.stderr  # no warnings
@@ -119,6 +120,29 @@ def test_its_clock_wraps_without_a_hole(bridge: Path) -> None:
     samples, _ = parts(run(bridge, 2.0, begin_us=2**32 - 1_000_000)[0])
     assert samples[0].t_us > samples[-1].t_us
     assert all(2400 < (b.t_us - a.t_us) % 2**32 < 2600 for a, b in pairwise(samples))
+
+
+@pytest.mark.parametrize(
+    "usb", [(), ("-DARDUINO_USB_CDC_ON_BOOT=1",), ("-DARDUINO_USB_CDC_ON_BOOT=1", "-DARDUINO_USB_MODE=1")]
+)
+def test_it_compiles_for_an_esp32_with_any_of_its_ports(tmp_path: Path, usb: tuple[str, ...]) -> None:
+    samples, _ = parts(run(compiled(tmp_path, "-DESP32", *usb), 0.5)[0])
+    assert len(samples) > 100
+
+
+@pytest.mark.parametrize(("chip", "error"), [(str(0x53), Status.ACCEL_ERROR), (GYRO, Status.GYRO_ERROR)])
+def test_one_transfer_without_an_answer_costs_8_ms(bridge: Path, chip: str, error: Status) -> None:
+    samples, _ = parts(run(bridge, 2.0, silent=(chip, "200", "201"))[0])
+    failed = [n for n, sample in enumerate(samples) if error in sample.status]
+    assert 0 < len(failed) <= 2
+    assert samples[failed[-1] + 1].t_us - samples[failed[0] - 1].t_us <= 8000
+
+
+def test_a_magnetometer_that_lost_its_settings_is_set_up_again(bridge: Path) -> None:
+    samples, _ = parts(run(bridge, 2.0, silent=(MAG, "0", "0"), forgets_at=40)[0])
+    failed = [n for n, sample in enumerate(samples) if Status.MAG_ERROR in sample.status]
+    assert 0 < len(failed) <= 100, "0.25 s"
+    assert any(Status.MAG_NEW in sample.status for sample in samples[failed[-1] :])
 
 
 def test_a_chip_that_goes_away_is_told_and_set_up_again(bridge: Path) -> None:

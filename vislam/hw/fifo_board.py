@@ -198,8 +198,7 @@ class FifoBoard:
 
     def _start_imu(self, bus: I2cBus) -> None:
         imu = self._set_up(bus)
-        is_tested = bool(imu.doubt) and not self.self_tests
-        if is_tested:
+        if imu.doubt and not self.self_tests:
             force = force_at_rest(imu, self._clock)
             is_asked = self._setup.named in (lsm6dsox.TWIN, mpu6050.CLONE)
             if force is not None and not is_asked and scale_test(imu, 2.0 * force).passed:
@@ -209,8 +208,9 @@ class FifoBoard:
             if test.passed is False and is_asked:
                 raise HardwareError(f"{bus.path}: the {imu.name} does not fit: {test.what}; use another board")
             self.self_tests = (test,)
+            imu.empty()
         self._samples.begin(imu, self._clock.now_ns() + round(imu.start_up_s * _NS))
-        self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, is_tested
+        self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, False
         if self._config.mag is None and not self._mag.link.is_wanted:
             with suppress(BusError):  # one that is on the board answers now: what is inside the chip is on the bus
                 self._mag.link.is_wanted = find_any_magnetometer(bus, self._config.mag_range_ga) is not None

@@ -33,6 +33,9 @@ struct FakeSerial {
   long waiting = 0;  // bytes of an AVR's buffer of 63 that are not on the wire yet, one of which goes in 20 us
   uint32_t at_us = 0;
   void begin(uint32_t) {}
+#if defined(ESP32) && !(ARDUINO_USB_CDC_ON_BOOT && !ARDUINO_USB_MODE)
+  void setTxBufferSize(size_t) {}
+#endif
   int availableForWrite() {
     const long gone = (long)((fake_us - at_us) / 20);
     waiting = waiting > gone ? waiting - gone : 0, at_us = fake_us;

@@ -2,8 +2,6 @@
 #pragma once
 #include "Arduino.h"
 
-#define WIRE_HAS_TIMEOUT 1
-
 struct FakeWire {
   uint8_t address = 0, reg = 0, sent = 0;
   uint8_t answer[16];
@@ -15,13 +13,19 @@ struct FakeWire {
   int transfers[128] = {};
   uint8_t who = 0, mpu_at = 0x68;        // what a MPU says in WHO_AM_I; 0: it is a GY-85
   bool has_hmc = true, has_ak = false;   // the latter behind the MPU
+  uint32_t timeout_us = 0;               // as the cores: without, a line that is held low stops the sketch for ever
   uint32_t appears_us = 0;               // before, nothing of either board answers
 
   void begin() {}
   void end() {}
   void setClock(uint32_t) {}
-  void setWireTimeout(uint32_t, bool) {}
+#if defined(ESP32)
+  void setTimeOut(uint16_t ms) { timeout_us = 1000UL * ms; }
+#else
+  void setWireTimeout(uint32_t us, bool) { timeout_us = us; }
+#endif
   bool present() {
+    if (timeout_us == 0) fprintf(stderr, "a transfer without a limit"), exit(3);
     fake_pass(100);
     int n = transfers[address]++;
     if (n == forgets_at && address == silent_address) memset(registers[address], 0, 128);
@@ -62,7 +66,8 @@ struct FakeWire {
       for (int i = 0; i < 6; i++) answer[answers++] = registers[from][0x15 + i];
       put(true, -13200), put(true, -n % 700), put(true, 0), put(true, n % 700), reads[from]++;
     }
-    if (from == 0x1E && reg == 0x03) put(true, 200 + n % 9), put(true, -400), put(true, n % 9), reads[from]++;
+    if (from == 0x1E && reg == 0x00)
+      memcpy(answer, registers[from], 3), answers = 3, put(true, 200 + n % 9), put(true, -400), put(true, n % 9), reads[from]++;
     return answers == count ? count : 0;
   }
   // Counts as the GY-85's above: accelerometer, temperature, gyro; nothing while it sleeps.

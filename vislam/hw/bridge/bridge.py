@@ -16,6 +16,7 @@ from vislam.core.errors import HardwareError, install_line
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.bridge.behind import Behind
 from vislam.hw.bridge.clock import DeviceClock
+from vislam.hw.bridge.frame_gaps import FrameGaps
 from vislam.hw.bridge.passer import Passer
 from vislam.hw.bridge.protocol import (
     PROTOCOL_VERSION,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
     import serial
 
+_MAG_STUCK = 10  # equal values of a magnetometer in a row: 0.2 s at the sketch's 50 Hz
 _STUCK_S = 0.25  # counts of a chip that do not change for so long: even at rest they have noise
 _NS = 1_000_000_000
 # pyserial raises all of them at a device that goes away; its own SerialException is an OSError
@@ -45,7 +47,6 @@ PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
 _READ_BYTES = 4096
 _GLANCE_S = 0.05  # while the first sample is waited for, so soon a port that cannot be opened is reported
 _NOMINAL_HZ = 400.0  # until the device states it
-_SEQUENCES = 2**16
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
 
 
@@ -80,13 +81,13 @@ class SerialBridge:
         self._retry_ns = 0  # when to open the port
         self._patience_ns = 0  # until when a frame must have come
         self._other_version: int | None = None
-        self._sequence: int | None = None
+        self._gaps = FrameGaps()
         self._counts: Counter[str] = Counter()
         self._events = Health(0)
         self._steps_reported = 0
         self._faults = Health(0)  # that the last frames report
         self._newest_ns = 0  # when the last inertial sample came
-        self._accel_watch, self._gyro_watch = _Watch(), _Watch()
+        self._accel_watch, self._gyro_watch, self._mag_watch = _Watch(), _Watch(), _Watch()
         self._temperature_c: float | None = None
         self._zero = GyroZero(config.calibrated_at_c)
         self._first: list[ImuSample | MagSample] = []
@@ -187,7 +188,7 @@ class SerialBridge:
         self._decoder.reset()
         self._clock.restart()
         self._behind.forget()
-        self._other_version = self._sequence = None
+        self._other_version, self._gaps = None, FrameGaps()
 
     def _wait_for_sample(self) -> None:
         end_ns = time.monotonic_ns() + round((self._config.start_s + 1.0) * _NS)
@@ -261,37 +262,35 @@ class SerialBridge:
             self._events |= Health.BUS_FAULT
             return []
         if isinstance(message, Hello):
-            self._greet(message)
+            self._greet(message, arrival_ns)
             return []
         if isinstance(message, Ages):
             self._behind.take_ages(message)
             return []
-        self._follow(message.sequence)
+        self._follow(message, arrival_ns)
         hello = self._behind.hello
         if hello is None or not self._behind.is_known:
             self._counts["before_hello"] += 1
             return []
         return self._sampled(message, hello, arrival_ns)
 
-    def _greet(self, hello: Hello) -> None:
+    def _greet(self, hello: Hello, arrival_ns: int) -> None:
         """Take what the device states about itself."""
         if Chips.STARTED in hello.chips and self._behind.hello is not None:
             self._counts["device_restarts"] += 1
             self._clock.restart()
-            self._sequence = None
-        self._follow(hello.sequence)
+            self._gaps = FrameGaps()
+        self._follow(hello, arrival_ns)
         self._behind.greet(hello)
         self._passer.greet(hello)
         self.rate_hz = float(hello.rate_hz)
 
-    def _follow(self, sequence: int) -> None:
+    def _follow(self, message: RawSample | Hello, arrival_ns: int) -> None:
         """Count frames that are missing before this one."""
-        if self._sequence is not None:
-            lost = (sequence - self._sequence - 1) % _SEQUENCES
-            if lost:
-                self._counts["frames_lost"] += lost
-                self._events |= Health.IMU_GAP
-        self._sequence = sequence
+        lost = self._gaps.before(message, arrival_ns)
+        if lost != 0:
+            self._counts["frames_lost"] += lost or 0
+            self._events |= Health.IMU_GAP
 
     def _sampled(self, raw: RawSample, hello: Hello, arrival_ns: int) -> list[ImuSample | MagSample]:
         stamp_ns = self._clock.stamp(raw.t_us, arrival_ns)
@@ -300,7 +299,8 @@ class SerialBridge:
             self._counts["unstamped"] += 1
             return []
         samples: list[ImuSample | MagSample] = []
-        if Status.MAG_NEW in raw.status and max(map(abs, raw.mag)) < hello.mag_limit:
+        is_sound = max(map(abs, raw.mag)) < hello.mag_limit and not self._faults & Health.MAG_FAULT
+        if Status.MAG_NEW in raw.status and is_sound:
             samples.append(self._behind.field(raw, stamp_ns))
         if raw.status & (Status.ACCEL_ERROR | Status.GYRO_ERROR):
             self._events |= Health.IMU_GAP | Health.BUS_FAULT
@@ -339,10 +339,17 @@ class SerialBridge:
                 faults |= Health.GYRO_FAULT
             told_c = raw.temperature * hello.temperature_nk * 1e-9 + hello.temperature_mc * 1e-3
             self._temperature_c = _smoothed(told_c, self._temperature_c, self.rate_hz)
-        if Status.MAG_NEW in raw.status and max(map(abs, raw.mag)) >= hello.mag_limit:
-            counts["mag_overflow"] += 1
-            self._events |= Health.MAG_FAULT
-        self._faults = faults
+        self._faults = faults | self._field_faults(raw, hello)
+
+    def _field_faults(self, raw: RawSample, hello: Hello) -> Health:
+        """Count the faults of a magnetometer's counts; return the bit that holds while they stay the same."""
+        if Status.MAG_NEW in raw.status:
+            if max(map(abs, raw.mag)) >= hello.mag_limit:
+                self._counts["mag_overflow"] += 1
+                self._events |= Health.MAG_FAULT
+            elif self._mag_watch.repeats(raw.mag) >= _MAG_STUCK:
+                self._counts["mag_stuck"] += 1
+        return Health.MAG_FAULT if self._mag_watch.count >= _MAG_STUCK else Health(0)
 
 
 class _Watch:
@@ -350,12 +357,12 @@ class _Watch:
 
     def __init__(self) -> None:
         self._last: tuple[int, ...] | None = None
-        self._repeats = 0
+        self.count = 0
 
     def repeats(self, values: tuple[int, ...]) -> int:
-        self._repeats = self._repeats + 1 if values == self._last else 0
+        self.count = self.count + 1 if values == self._last else 0
         self._last = values
-        return self._repeats
+        return self.count
 
 
 def _smoothed(told_c: float, before_c: float | None, rate_hz: float) -> float:

@@ -129,7 +129,7 @@ static uint8_t bodyLength;
 static void beginBus() {
   Wire.begin();
   Wire.setClock(I2C_HZ);
-#if defined(WIRE_HAS_TIMEOUT)
+#if defined(ARDUINO_ARCH_AVR) || defined(WIRE_HAS_TIMEOUT)  // Arduino's AVR core has it and does not define that
   Wire.setWireTimeout(I2C_TIMEOUT_MS * 1000UL, true);
 #elif defined(ESP32)
   Wire.setTimeOut(I2C_TIMEOUT_MS);
@@ -334,12 +334,13 @@ static bool beginMag() {
 
 static bool readMag() {
   if (magIsAk) return readAk();
-  uint8_t data[6];
+  uint8_t data[9];  // its settings, which it loses with its power, and what it measured
   magFresh = true;
-  if (!readRegisters(magChip.address, 0x03, data, 6)) return false;
-  mag[0] = bigEndian(data);
-  mag[2] = bigEndian(data + 2);  // the chip has x, z, y
-  mag[1] = bigEndian(data + 4);
+  if (!readRegisters(magChip.address, 0x00, data, 9) || data[0] != 0x18 || data[1] != 0x20 || data[2] != 0x00)
+    return false;
+  mag[0] = bigEndian(data + 3);
+  mag[2] = bigEndian(data + 5);  // the chip has x, z, y
+  mag[1] = bigEndian(data + 7);
   return true;
 }
 
@@ -348,7 +349,7 @@ static bool readOrRetry(Chip &chip, bool (*begin)(), bool (*read)(), bool &retri
   if (chip.ready) {
     if (read()) return true;
     chip.ready = false;
-    chip.tried_ms = millis();
+    chip.tried_ms = millis() - RETRY_MS;  // it may be well again in the next sample
     return false;
   }
   if (!retried && millis() - chip.tried_ms >= RETRY_MS) {
@@ -570,7 +571,7 @@ static void sampleAndSend(uint32_t timeUs) {
 }
 
 void setup() {
-#if defined(ESP32)
+#if defined(ESP32) && !(ARDUINO_USB_CDC_ON_BOOT && !ARDUINO_USB_MODE)  // no member of USBCDC, which S2 and S3 may have
   Serial.setTxBufferSize(512);
 #endif
   Serial.begin(BAUD);

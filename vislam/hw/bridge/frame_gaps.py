@@ -1,0 +1,30 @@
+"""How many frames are missing between two that came over the serial bridge."""
+
+from __future__ import annotations
+
+from vislam.hw.bridge.protocol import Hello, RawSample
+
+_SEQUENCES, _WRAP_US = 2**16, 2**32
+_MOST_STALL_US = 60e6  # for which the host may be put aside while frames are dropped
+
+
+class FrameGaps:
+    """Owns the last frame with a sequence, and when it arrived."""
+
+    def __init__(self) -> None:
+        self._last: RawSample | Hello | None = None
+        self._last_ns = 0
+
+    def before(self, frame: RawSample | Hello, arrival_ns: int) -> int | None:
+        """Return how many frames are missing before this one; None where the device began again.
+
+        Its first samples come before the hello that states so: its time goes back, or on by far more than the host's.
+        """
+        last, last_ns = self._last, self._last_ns
+        self._last, self._last_ns = frame, arrival_ns
+        if last is None:
+            return 0
+        on_us = (frame.t_us - last.t_us) % _WRAP_US
+        if on_us > (arrival_ns - last_ns) / 1000.0 + _MOST_STALL_US:
+            return None
+        return (frame.sequence - last.sequence - 1) % _SEQUENCES
