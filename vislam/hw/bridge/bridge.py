@@ -87,7 +87,7 @@ class SerialBridge:
         self._steps_reported = 0
         self._faults = Health(0)  # that the last frames report
         self._newest_ns = 0  # when the last inertial sample came
-        self._accel_watch, self._gyro_watch, self._mag_watch = _Watch(), _Watch(), _Watch()
+        self._watches = {name: _Watch() for name in ("accel", "gyro", "mag")}
         self._temperature_c: float | None = None
         self._zero = GyroZero(config.calibrated_at_c)
         self._first: list[ImuSample | MagSample] = []
@@ -327,14 +327,14 @@ class SerialBridge:
             if max(map(abs, raw.accel)) >= hello.accel_limit:
                 counts["accel_saturated"] += 1
                 self._events |= Health.ACCEL_SATURATED
-            if self._accel_watch.repeats(raw.accel) >= stuck:
+            if self._watches["accel"].repeats(raw.accel) >= stuck:
                 counts["accel_stuck"] += 1
                 faults |= Health.ACCEL_FAULT
         if Status.GYRO_ERROR not in raw.status:
             if max(map(abs, raw.gyro)) >= hello.gyro_limit:
                 counts["gyro_saturated"] += 1
                 self._events |= Health.GYRO_SATURATED
-            if self._gyro_watch.repeats((*raw.gyro, raw.temperature)) >= stuck:
+            if self._watches["gyro"].repeats((*raw.gyro, raw.temperature)) >= stuck:
                 counts["gyro_stuck"] += 1
                 faults |= Health.GYRO_FAULT
             told_c = raw.temperature * hello.temperature_nk * 1e-9 + hello.temperature_mc * 1e-3
@@ -347,9 +347,9 @@ class SerialBridge:
             if max(map(abs, raw.mag)) >= hello.mag_limit:
                 self._counts["mag_overflow"] += 1
                 self._events |= Health.MAG_FAULT
-            elif self._mag_watch.repeats(raw.mag) >= _MAG_STUCK:
+            elif self._watches["mag"].repeats(raw.mag) >= _MAG_STUCK:
                 self._counts["mag_stuck"] += 1
-        return Health.MAG_FAULT if self._mag_watch.count >= _MAG_STUCK else Health(0)
+        return Health.MAG_FAULT if self._watches["mag"].count >= _MAG_STUCK else Health(0)
 
 
 class _Watch:

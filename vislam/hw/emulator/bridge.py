@@ -60,6 +60,7 @@ class LineFaults:
     no_accel: bool = False  # the chip does not answer
     no_gyro: bool = False
     frozen: bool = False  # the gyro gives the same counts for ever
+    frozen_mag: bool = False
 
 
 class BridgeEmulator:
@@ -223,6 +224,8 @@ class BridgeEmulator:
         temperature = round((temperature_c - hello.temperature_mc * 1e-3) / (hello.temperature_nk * 1e-9))
         if self.faults.frozen:
             counts, temperature = (1, 2, 3), 0
+        if self.faults.frozen_mag:
+            field = (200, -400, 8)
         accel_lsb, most = 1.0 / (hello.accel_nm_s2 * 1e-9), board.accel_most
         return RawSample(
             sequence, t_us, status,
