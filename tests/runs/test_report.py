@@ -313,6 +313,33 @@ def test_large_pictures_are_made_smaller(copy):
     assert image.shape == (1000, 1600, 3)
 
 
+def test_nothing_that_a_link_leads_to_is_in_a_report(copy, tmp_path_factory):
+    elsewhere, loop = tmp_path_factory.mktemp("elsewhere"), next(loop for loop in read_run(copy).loops)
+    (elsewhere / "secret.txt").write_text("not to be passed on")
+    image = np.full((20, 30, 3), 90, np.uint8)
+    cv2.imwrite(str(elsewhere / "private.png"), image)
+    (copy / "loops").mkdir()
+    name = f"loops/00_{loop.from_id}_{loop.to_id}_{loop.decision}.jpg"
+    for link, target in ((name, "secret.txt"), ("map/picture_above.png", "private.png")):
+        (copy / link).unlink(missing_ok=True)
+        (copy / link).symlink_to(elsewhere / target)
+    text = write_report(copy).read_text()
+    assert base64.b64encode(b"not to be passed on").decode() not in text
+    assert 'alt="above"' not in text
+    assert text.count("is a link that leads out of the run folder") == 2
+
+
+def test_only_what_was_decoded_is_embedded(copy):
+    image = cv2.imencode(".png", np.full((20, 30, 3), 90, np.uint8))[1].tobytes()
+    for name, data in (("picture_a.png", image + b"what is behind it"), ("picture_b.png", b"text"), ("c.webp", image)):
+        (copy / "map" / name).write_bytes(data)
+    text = write_report(copy).read_text()
+    embedded = base64.b64decode(re.search(r'alt="a" src="data:image/png;base64,([^"]+)"', text)[1])
+    assert np.all(cv2.imdecode(np.frombuffer(embedded, np.uint8), cv2.IMREAD_COLOR) == 90)
+    assert b"what is behind it" not in embedded
+    assert "picture_b.png is not a readable image" in text
+
+
 def test_folders_that_hold_no_run(tmp_path):
     with pytest.raises(DataError, match=r"neither metrics\.json nor a trajectory"):
         write_report(tmp_path)

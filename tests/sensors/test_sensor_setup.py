@@ -82,7 +82,7 @@ WRONG = {
     "[sensors.'a b']\nkind='height'": "[sensors.a b]: a name of letters",
     "[sensors.a]\nkind='height'\nsigma=1.0": "[sensors.a]: no option 'sigma'; there are: baud, correlated_sigma,",
     "[sensors.a]\nkind='height'\nsigma_m='x'": "[sensors.a]: option sigma_m: Input should be a valid number",
-    "[sensors.a]\nkind='height'\nsigma_m=0.0": "[sensors.a]: sigma_m is 0; allowed is more than 0",
+    "[sensors.a]\nkind='height'\nsigma_m=0.0": "[sensors.a]: sigma_m is 0; allowed is 1e-06 or more and 100000 at most",
     "[sensors.a]\nkind='height'\nsigma_m=nan": "[sensors.a]: sigma_m is nan",
     "[sensors.a]\nkind='height'\nlever_m=[1.0,2.0]": "[sensors.a]: option lever_m",
     "[sensors.a]\nkind='height'\noffset_s='now'": "[sensors.a]: option offset_s",
@@ -117,7 +117,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, text: str) -> None:
 def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="No such file"):
         load_sensor_setup(tmp_path / "none.toml")
-    with pytest.raises(UsageError, match="larger than the 1 MiB"):
+    with pytest.raises(UsageError, match="larger than the 0.25 MiB"):
         load(tmp_path, "#" * (2**20 + 1))
 
 

@@ -125,7 +125,7 @@ class ImuOptions:
     """full: scale, axes, bias; scale: axes as they are, for which seven poses do"""
     rest_s: Positive = 2.0
     """A pose counts when it was held so long"""
-    gravity_m_s2: Positive = 9.81
+    gravity_m_s2: Annotated[float, Range(0.1, 100.0)] = 9.81
     """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as machine.gravity_m_s2 of the config"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""

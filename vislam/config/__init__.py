@@ -5,7 +5,6 @@ which every run writes down as `config.json`.
 """
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from vislam.config.machine import USUAL_SLIP_M_S, MachineConfig
 from vislam.config.mapping import DriveConfig, LabelConfig, MapConfig, MapProduct, MonoDepthConfig
 from vislam.config.moved import known, renamed
 from vislam.config.profiles import merged, profile
-from vislam.config.ranges import Finite, NonNegative, Positive, Whole, check_ranges
+from vislam.config.ranges import Finite, NonNegative, Positive, Seed, check_ranges
 from vislam.config.sensors import (
     Axes,
     BoardConfig,
@@ -43,7 +42,7 @@ from vislam.config.sensors import (
     WebcamConfig,
 )
 from vislam.core.errors import UsageError
-from vislam.core.reading import read_text
+from vislam.core.reading import read_toml
 
 __all__ = [
     "USUAL_SLIP_M_S",
@@ -111,7 +110,7 @@ Options = TypeVar("Options")
 class Config:
     """The whole configuration of a run."""
 
-    seed: Whole = 0  # of every random choice in the pipeline
+    seed: Seed = 0  # of every random choice in the pipeline
     up: str = "auto"  # without an IMU: X,Y,Z in the first camera's axes, camera (as its first image has it) or none
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     machine: MachineConfig = field(default_factory=MachineConfig)
@@ -176,8 +175,8 @@ def load_cart(path: Path | None) -> tuple[SensorsConfig, FurtherSensorsConfig]:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(read_text(path))
-    except (OSError, ValueError, RecursionError) as error:
+        return read_toml(path)
+    except (OSError, ValueError) as error:
         raise UsageError(f"config {path} cannot be read: {error}; see docs/config.md for an example") from error
 
 

@@ -1,9 +1,9 @@
 """Defaults of batch optimisation, of runs and of pose-graph files."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from vislam.config.ranges import Count, NonNegative, Positive, Probability, Share, Whole
+from vislam.config.ranges import Count, Many, NonNegative, Positive, Probability, Range, Seed, Share
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,7 +12,7 @@ class BatchConfig:
 
     rounds: Count = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
     huber_k: Positive = 2.0  # standard deviations, in later rounds
-    max_observations: Count = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
+    max_observations: Many = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
     vision_inflation: Positive = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
     covariances: bool = True  # of all states; costs about as much as a round
 
@@ -30,7 +30,7 @@ class PoseGraphConfig:
     robust: Literal["none", "auto", "cauchy", "geman-mcclure", "dcs", "gnc"] = "none"
     rescale_noise: bool = False  # variances of each kind of edge multiplied by what its residuals show, solved anew
     iterations: Count = 100  # most of them; 3 to 8 as a rule
-    tolerance: Positive = 1e-9  # of the cost: the decrease still to come at which to end
+    tolerance: Annotated[float, Range(1e-15, 1.0)] = 1e-9  # of the cost: the decrease still to come at which to end
     inlier_probability: Probability = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
     noise: bool = True  # report what residuals show of the stated noise: takes about as long as finding the optimum
     certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
@@ -44,11 +44,11 @@ class PoseGraphConfig:
 class GraphWorldConfig:
     """A made pose graph, as `vislam simulate --graph` writes it. Noise is white, of odometry and loops alike."""
 
-    poses: Count = 1000
+    poses: Many = 1000
     loops_per_pose: NonNegative = 1.0  # true ones; only between poses that are at most 5 m apart
     rotation_sigma_deg: NonNegative = 1.0  # per axis; the drift of a thousand steps then needs its loops
     translation_sigma_m: NonNegative = 0.05  # per axis; 5 % of a step, poor odometry
     anisotropy: Positive = 1.0  # forward, and about z, the sigmas are this many times as large
     outlier_fraction: Share = 0.0  # of all loops
     alias_group: Count = 1  # so many false loops in a row agree, as a corridor that looks like another one gives them
-    seed: Whole = 0  # same seed, same graph
+    seed: Seed = 0  # same seed, same graph

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from vislam.config.ranges import Count, NonNegative, Positive, Probability, Share, Whole
+from vislam.config.ranges import Count, Few, NonNegative, Positive, Probability, Share, Whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class EkfConfig:
 class WindowConfig:
     """The sliding window of tight coupling: poses, velocities, biases and landmarks of the newest keyframes."""
 
-    keyframes: Count = 15  # states in the window; the oldest one is marginalised when another comes
+    keyframes: Few = 15  # states in the window; the oldest one is marginalised when another comes
     iterations: Count = 6  # most Gauss-Newton steps per keyframe; two or three are usual
     # of a tracked corner between keyframes; more where the frame's tracks scatter by over 0.4 px
     sigma_px: Positive = 1.0

@@ -55,7 +55,7 @@ class FrontEndConfig:
     # rolling shutter, first to last row; 0 is global, None estimates it while running
     readout_s: NonNegative | None = None
 
-    min_depth_m: NonNegative = 0.3  # nearer is out of focus or out of range
+    min_depth_m: Positive = 0.3  # nearer is out of focus or out of range
     max_depth_m: NonNegative = 8.0  # of depth images: beyond, structured light guesses
     # 1/m: sigma of z is this times z^2; 1.4e-3 is a Kinect's own, the rest registration
     depth_sigma_rho: Positive = 2e-3
@@ -91,9 +91,9 @@ class FrontEndConfig:
 class InitConfig:
     """How the first gravity-aligned state is found."""
 
-    rest_s: NonNegative = 0.75  # the IMU's statistics need this long; shorter pauses happen in hand-held motion
+    rest_s: Positive = 0.75  # the IMU's statistics need this long; shorter pauses happen in hand-held motion
     mono_window_s: NonNegative = 4.0  # without scale, acceleration has to be seen against its bias, which takes longer
-    accel_bias_sigma_m_s2: NonNegative = 0.2  # prior; a calibrated cheap accelerometer
+    accel_bias_sigma_m_s2: Positive = 0.2  # prior; a calibrated cheap accelerometer
     gyro_bias_sigma_rad_s: NonNegative = 0.5  # prior for the motion start; wide enough for the ITG3205's 40 deg/s
     # relative, monocular only: a provisional start, which the window that follows refines
     max_scale_sigma: NonNegative = 0.1

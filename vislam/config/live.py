@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability, Range
+from vislam.config.ranges import Count, Finite, Many, NonNegative, Positive, Probability, Range
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class ViewConfig:
     image_width_px: Count = 320  # a JPEG of this width costs 1.5 ms and 9 kB; VGA costs three times that
     cloud_points: Count = 4000  # per keyframe, from depth; sparse features are all kept
     map_every_s: Positive = 5.0  # octree and grid are written again so often at most
-    map_voxels: Count = 20_000  # at most in each, larger maps get coarser ones; 16 bytes each
+    map_voxels: Many = 20_000  # at most in each, larger maps get coarser ones; 16 bytes each
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from vislam.config.ranges import Count, NonNegative, Positive, Share, Whole
+from vislam.config.ranges import Count, Few, Many, NonNegative, Positive, Seed, Share, Whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +39,9 @@ class LoopConfig:
     training_growth: Positive = 1.25  # keyframes, until trained again: words find less what they were not trained on
     min_training_lag: Whole = 2  # keyframes that come during a training, at least ...
     catch_up_keyframes: Whole = 8  # of those, so many are indexed with each new one once it is done: 0.4 ms each
-    training_descriptors: Count = 500_000  # at most: bounds a training, in the background, to 2 s
-    vocabulary_branching: Count = 10  # children of a node
-    vocabulary_depth: Count = 6  # levels at most; as many as leave each word five descriptors
+    training_descriptors: Many = 500_000  # at most: bounds a training, in the background, to 2 s
+    vocabulary_branching: Few = 10  # children of a node
+    vocabulary_depth: Few = 6  # levels at most; as many as leave each word five descriptors
     # with --map OLD and a depth camera: where no image finds the map, depth is asked about the pose carried on so far
     depth_in_map: bool = True
     depth_in_a_row: Count = 3  # keyframes whose answers agree through odometry, before one is offered: rooms repeat
@@ -65,4 +65,4 @@ class LoopTruthConfig:
     gross_m: NonNegative = 0.5  # an edge whose translation is off by more would ruin a map
     gross_deg: NonNegative = 10.0  # or whose rotation is
     max_truth_gap_s: NonNegative = 0.3  # true poses are interpolated over less: a few millimetres by hand or on wheels
-    seed: Whole = 0  # of the bootstrap
+    seed: Seed = 0  # of the bootstrap

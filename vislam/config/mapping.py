@@ -3,7 +3,19 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, PositiveShare, Probability, Range, Share, Whole
+from vislam.config.ranges import (
+    Cell,
+    Count,
+    Few,
+    Finite,
+    NonNegative,
+    Positive,
+    PositiveShare,
+    Probability,
+    Range,
+    Share,
+    Whole,
+)
 from vislam.core.kinds import check_name
 
 
@@ -11,13 +23,13 @@ from vislam.core.kinds import check_name
 class DriveConfig:
     """Where the cart can stand and drive, from the octree."""
 
-    body_length_m: Positive = 0.60  # of the cart, whose middle is the body's origin
-    body_width_m: Positive = 0.50
+    body_length_m: Annotated[float, Range(0.01, 50.0)] = 0.60  # of the cart, whose middle is the body's origin
+    body_width_m: Annotated[float, Range(0.01, 50.0)] = 0.50
     # between neighbouring cells; less than a voxel is taken for one, which is what is seen
     max_step_m: NonNegative = 0.05
     max_slope_deg: NonNegative = 10.0  # what a cart with small wheels and a load brakes on
     # slope is that of a plane through the ground within it: a voxel's step is no slope
-    slope_window_m: NonNegative = 0.40
+    slope_window_m: Annotated[float, Range(0.0, 10.0)] = 0.40
 
 
 _OwnProduct = Literal["cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
@@ -52,9 +64,9 @@ class MonoDepthConfig:
     # an image turned by more is turned back, which leaves out what does not fit; without warped patches 1.5 is good
     derotate_deg: NonNegative = 180.0
     handover_sigma: NonNegative = 0.05  # of inverse depth that the next keyframe takes over; it measures anew
-    keyframes: Count = 3  # later ones that feed a keyframe before the next is begun; more parallax, fewer depth images
+    keyframes: Few = 3  # later ones that feed a keyframe before the next is begun; more parallax, fewer depth images
     max_range_m: NonNegative = 8.0  # farther points only clear the way
-    threads: Count = 2  # the result does not depend on it
+    threads: Few = 2  # the result does not depend on it
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +84,7 @@ class MapConfig:
     """Clouds, the occupancy octree, the navigation grid and the mesh."""
 
     enabled: bool = True  # off: no cloud, octree or grid
-    resolution_m: Positive = 0.05  # octree voxel and grid cell; fine enough for table edges, 8 ms per keyframe
+    resolution_m: Cell = 0.05  # octree voxel and grid cell; fine enough for table edges, 8 ms per keyframe
     insertion: Literal["discretised", "full"] = "discretised"  # one ray per end voxel; full: one per pixel, 10x dearer
     hit_probability: Probability = 0.7  # OctoMap's
     # OctoMap's 0.4 is for 10 scans a second; of keyframes, at 2 Hz and more, with the
@@ -93,22 +105,23 @@ class MapConfig:
     move_voxels: NonNegative = 1.0  # a keyframe corrected by more than this many voxels is integrated again
     move_deg: NonNegative = 1.0  # or turned by more than this: 7 cm at 4 m
     rebuild_keyframes_per_call: Whole = 8  # that cast rays again in one call while a correction is followed; 3 ms each
-    cloud_voxel_m: Positive = 0.015  # one averaged point per voxel in cloud.ply
+    cloud_voxel_m: Cell = 0.015  # one averaged point per voxel in cloud.ply
     cloud_min_points: Whole = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
     cloud_neighbours: Whole = 12  # statistical outlier removal: mean distance to so many neighbours
     cloud_outlier_sigma: NonNegative = 2.5  # may exceed the average by so many standard deviations
-    cloud_smooth_m: NonNegative = 0.0  # radius of moving least squares, three voxels or more; 0: points as measured
+    # radius of moving least squares, three voxels or more; 0: points as measured
+    cloud_smooth_m: Annotated[float, Range(0.0, 10.0)] = 0.0
     grid_floor_m: Finite | None = None  # height of the floor in map; None: the lowest large horizontal surface
     grid_low_m: Finite = 0.10  # above the floor: lower things are driven over or are the floor's own noise
     grid_high_m: Finite = 1.60  # above the floor: higher things are driven under
     drive: DriveConfig = field(default_factory=DriveConfig)
     # where a surface is asked for, its map is made at poses that fit the depth of keyframes to each other: 0.1 s each
     refine_poses: bool = True
-    mesh_voxel_m: Positive = 0.01  # about the noise of depth at 2 m; farther views count less, by that noise
+    mesh_voxel_m: Cell = 0.01  # about the noise of depth at 2 m; farther views count less, by that noise
     mesh_max_blocks: Count = 40_000  # of 8 x 8 x 8 voxels, 12 kB each; a mesh that takes more gets larger voxels
     mesh_min_views: Count = 2  # a surface that fewer keyframes saw is left out where other rays passed through it
     mesh_atlas_px: Annotated[int, Range(0, 16384)] = 4096  # edge of the picture on mesh.glb; 0: colours of vertices
-    surfel_m: Positive = 0.02  # between surfels
+    surfel_m: Cell = 0.02  # between surfels
     surfel_min_views: Count = 2  # keyframes that must have seen a surfel; what one alone saw may be noise
     poisson_depth: Annotated[int, Range(1, 16)] = 9  # levels of Poisson's octree: cells of 2 cm in a room of 10 m
     # what is written into map/; mesh, glb, obj and poisson need Open3D and take seconds, surfels too

@@ -19,8 +19,8 @@ from vislam.core.errors import UsageError
 class Range:
     """An interval of finite numbers, its ends included where they are not said to be left out."""
 
-    low: float = -math.inf
-    high: float = math.inf
+    low: float
+    high: float
     without_low: bool = False
     without_high: bool = False
 
@@ -33,18 +33,25 @@ class Range:
     def __str__(self) -> str:
         low = f"more than {self.low:g}" if self.without_low else f"{self.low:g} or more"
         high = f"less than {self.high:g}" if self.without_high else f"{self.high:g} at most"
-        ends = [text for end, text in ((self.low, low), (self.high, high)) if math.isfinite(end)]
-        return " and ".join(ends) or "any finite number"
+        return f"{low} and {high}"
 
 
-Finite = Annotated[float, Range()]
-NonNegative = Annotated[float, Range(0.0)]
-Positive = Annotated[float, Range(0.0, without_low=True)]
+_HUGE = 1e9
+# by the ending of a setting's name, where its type allows more: an image's edge, a circle, half a day, 100 km, ...
+_MOST_OF = {"_px": 2.0**14, "_deg": 360.0, "_s": 5e4, "_m": 1e5, "_hz": 1e5}
+
+Finite = Annotated[float, Range(-_HUGE, _HUGE)]
+NonNegative = Annotated[float, Range(0.0, _HUGE)]
+Positive = Annotated[float, Range(1e-6, _HUGE)]
+Cell = Annotated[float, Range(1e-3, 1e3)]  # edge of the cells of a map, in metres: memory goes with its third power
 Share = Annotated[float, Range(0.0, 1.0)]
 PositiveShare = Annotated[float, Range(0.0, 1.0, without_low=True)]
 Probability = Annotated[float, Range(0.0, 1.0, without_low=True, without_high=True)]
-Whole = Annotated[int, Range(0)]
-Count = Annotated[int, Range(1)]
+Whole = Annotated[int, Range(0, 100_000)]
+Count = Annotated[int, Range(1, 100_000)]
+Few = Annotated[int, Range(1, 100)]  # of what each costs megabytes or a thread
+Many = Annotated[int, Range(1, 10_000_000)]  # of what each costs bytes
+Seed = Annotated[int, Range(0, 2**32 - 1)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +66,11 @@ class Setting:
     @property
     def range(self) -> Range | None:
         """The interval that every number in it must lie in; None where it has no number."""
-        return range_of(self.type)
+        found, name = range_of(self.type), self.path[-1]
+        most = next((most for ending, most in _MOST_OF.items() if name.endswith(ending)), math.inf)
+        if found is None or most >= found.high:
+            return found
+        return dataclasses.replace(found, low=max(found.low, -most), high=most)
 
     @property
     def option(self) -> str:

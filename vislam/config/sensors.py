@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from vislam.config.frontend import CalibrationConfig
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range
+from vislam.config.ranges import Count, Few, Finite, Many, NonNegative, Positive, Range
 
 ImuChip = Literal["auto", "lsm6dsox", "mpu6050", "icm20948", "bmi270"]
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -60,7 +60,7 @@ class BoardConfig:
 
     chip: ImuChip = "auto"  # a family, known by its id; auto: whichever answers
     bus: str = "/dev/i2c-1"  # pins 3 and 5 of a Raspberry Pi
-    address: Count | None = None  # None: wherever such a chip can be
+    address: Annotated[int, Range(1, 127)] | None = None  # None: wherever such a chip can be
     rate_hz: Positive = 200.0  # or the next higher rate that the chip has; 400 Hz need a bus of 400 kHz
     gyro_range_deg_s: Literal[250, 500, 1000, 2000] = 500  # a cart turns by 200 at most; in the hand ask for 2000
     accel_range_g: Literal[2, 4, 8, 16] = 8  # wheels on thresholds give 5
@@ -88,7 +88,7 @@ class SerialConfig:
     """The serial bridge: a microcontroller that reads the inertial chips, docs/sensors.md."""
 
     port: str = "/dev/ttyUSB0"  # the path in /dev/serial/by-id stays the same when other devices come and go
-    baud: Count = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
+    baud: Many = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
     filter_s: NonNegative = 0.0033  # delay of the gyro's 98 Hz filter, and half a millisecond of its sampling
     missing_s: NonNegative = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
     # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it anew
@@ -115,7 +115,7 @@ class WebcamConfig:
     # in units of the camera, 0 is infinity; None leaves autofocus on, which moves the centre
     focus: Finite | None = 0.0
     white_balance_k: NonNegative | None = None  # None leaves it to the camera: tracking uses grey images
-    buffers: Count = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
+    buffers: Few = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
     # from capture to arrival, where the driver's stamps cannot be used: exposure, readout, USB
     delay_s: NonNegative = 0.05
     missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
@@ -145,7 +145,7 @@ class PicamConfig(LibraryCameraConfig):
 
     device: str = "0"  # its number, as rpicam-hello counts
     focus: NonNegative | None = 0.0  # dioptres, 0 is infinity; None leaves autofocus on, which moves the centre
-    buffers: Count = 4  # one is read, one waits, two are with the camera
+    buffers: Few = 4  # one is read, one waits, two are with the camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +206,7 @@ class RecordConfig:
     min_free_gb: NonNegative = 1.0  # and when the disk has less left: a full root disk stops the machine
     image_format: Literal["jpg", "png"] = "jpg"  # MJPG cameras give no more; png takes five times the space
     image_queue: Count = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
-    imu_queue: Count = 8000  # samples that may wait: 18 s at 450 Hz
+    imu_queue: Many = 8000  # samples that may wait: 18 s at 450 Hz
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from vislam.core.geometry import are_rotations, invert
 from vislam.core.jit import njit
 from vislam.core.lens import Lens, distort, imaged
 from vislam.core.messages import Array
+from vislam.core.reading import MAX_PIXELS
 
 MapF32 = NDArray[np.float32]
 Distortion = Literal["none", "radtan", "equidistant", "rational"]
@@ -159,6 +160,8 @@ class Camera:
             raise DataError(f"camera intrinsics must be finite with positive focal lengths, got {numbers.tolist()}")
         if self.width <= 0 or self.height <= 0:
             raise DataError(f"camera image size must be positive, got {self.width}x{self.height}")
+        if self.width * self.height > MAX_PIXELS:
+            raise DataError(f"camera images must have at most {MAX_PIXELS} pixels, got {self.width}x{self.height}")
         if self.distortion not in _MODEL_CODES:
             raise DataError(f"camera distortion '{self.distortion}' is unknown; known: {', '.join(_MODEL_CODES)}")
         allowed = _COEFFICIENT_COUNTS[self.distortion]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copyreg
 import errno
 
+_MOST_OF_END = 1000  # characters of a message that quotes a file without end
+
 
 def printable(text: object) -> str:
     """Return text with escapes in the place of what a terminal would obey or not show.
@@ -33,8 +35,11 @@ class VislamError(Exception):
         return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
     def __str__(self) -> str:
-        """Return the message in one line of printable characters."""
-        return printable(super().__str__())
+        """Return the message in one line of printable characters; the middle of a very long one is left out."""
+        said = super().__str__()
+        if len(said) > 2 * _MOST_OF_END:
+            said = f"{said[:_MOST_OF_END]} [...] {said[-_MOST_OF_END:]}"
+        return printable(said)
 
 
 class UsageError(VislamError):

@@ -2,6 +2,8 @@
 
 What is no regular file is refused before anything is read of it: a FIFO or a terminal would block for ever, and a
 device may have no end. All refusals are OSErrors with a `strerror`, as those of the system are.
+
+What is parsed here has one budget: what a text asks for is bounded by its length before anything of it is built.
 """
 
 from __future__ import annotations
@@ -10,6 +12,8 @@ import errno
 import json
 import os
 import stat
+import tomllib
+from collections.abc import Iterable
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -17,6 +21,12 @@ from typing import Any
 _MAX_JSON_BYTES = 256 * 2**20  # metrics of the longest runs come to a tenth
 _POINTER, _MAX_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
 _MAX_TEXT_BYTES = 16 * 2**20  # settings, plans, calibrations
+MAX_YAML_BYTES = MAX_TOML_BYTES = 2**18  # written by hand, or by a calibration; a second's work at most
+MAX_PIXELS = 2**25  # of an image: 8K video; whatever else a camera, a header or a message states is refused
+_FREE_NODES = 10_000  # of YAML, beside one for each byte: what aliases and merge keys may add
+_MAX_DOTS = 100  # in a line of TOML: work and memory go with the square of a dotted key's parts
+_MAX_DEPTH = 64  # of tables within tables
+_MAX_SCALAR = 2**15  # characters: 1:1:1... is a number to base 60, whose work goes with the square
 
 
 def open_file(path: Path) -> BufferedReader:
@@ -47,7 +57,7 @@ def read_bytes(path: Path, most_bytes: int) -> bytes:
         size = os.fstat(file.fileno()).st_size
         data = file.read(min(size, most_bytes) + 1)  # takes as much memory as it is asked for
     if max(size, len(data)) > most_bytes:
-        raise OSError(errno.EFBIG, f"larger than the {most_bytes / 2**20:.0f} MiB that are read", str(path))
+        raise OSError(errno.EFBIG, f"larger than the {most_bytes / 2**20:.3g} MiB that are read", str(path))
     return data
 
 
@@ -67,6 +77,80 @@ def parse_json(text: str) -> Any:
         return json.loads(text)
     except RecursionError as error:
         raise ValueError("JSON nested too deep") from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the tables in TOML; raises ValueError for what is none, too large or too deep."""
+    if len(text) > MAX_TOML_BYTES:
+        raise ValueError(f"more than the {MAX_TOML_BYTES} characters that are read of TOML")
+    for number, line in enumerate(text.split("\n"), 1):  # keys end with their line
+        if line.count(".") > _MAX_DOTS:
+            raise ValueError(f"line {number} has more than {_MAX_DOTS} dots: dotted keys, or numbers to be wrapped")
+    try:
+        data = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("TOML nested too deep") from error
+    _check_depth(data)
+    return data
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables in a TOML file; raises OSError, and ValueError as `parse_toml`."""
+    return parse_toml(read_text(path, MAX_TOML_BYTES))
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the data in YAML; raises ValueError for what is none, too deep, or more than its length justifies."""
+    import yaml  # late: most never read any
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's is five times as fast
+    try:
+        _check_yaml(yaml.parse(text, loader), len(text) + _FREE_NODES)
+        return yaml.load(text, loader)  # noqa: S506 (a safe one, either of the two)
+    except (yaml.YAMLError, ArithmeticError, LookupError, AttributeError, TypeError, RecursionError) as error:
+        # besides its own errors PyYAML raises what comes of `!!int ""`, `!!bool x` or `!!timestamp x`
+        raise ValueError(" ".join(str(error).split())[:200]) from error
+
+
+def _check_yaml(events: Iterable[Any], most_nodes: int) -> None:
+    """Raise ValueError for YAML that is deep, or has more nodes than `most_nodes` once its aliases are spelt out."""
+    sizes: dict[str, int] = {}  # of what has an anchor, once it is complete
+    open_nodes: list[tuple[str, int]] = [("", 0)]
+    for event in events:
+        kind, anchor = type(event).__name__, str(getattr(event, "anchor", None) or "")
+        if kind in ("SequenceStartEvent", "MappingStartEvent"):
+            sizes.pop(anchor, None)
+            open_nodes.append((anchor, 1))
+            if len(open_nodes) > _MAX_DEPTH:
+                raise ValueError(f"nested deeper than {_MAX_DEPTH}")  # libyaml's composer would exhaust the stack
+            continue
+        if kind in ("SequenceEndEvent", "MappingEndEvent"):
+            anchor, size = open_nodes.pop()
+        elif kind == "AliasEvent":
+            if anchor not in sizes:
+                raise ValueError(f"alias *{anchor[:40]} within what it stands for, or of nothing")
+            size = sizes[anchor]
+        elif kind == "ScalarEvent":
+            size = 1 if len(event.value) <= _MAX_SCALAR else most_nodes + 1
+        else:
+            continue
+        if anchor:
+            sizes[anchor] = size
+        outer, so_far = open_nodes[-1]
+        open_nodes[-1] = (outer, so_far + size)
+        if so_far + size > most_nodes:
+            raise ValueError("aliases, merge keys or a scalar that ask for far more than any such file holds")
+
+
+def _check_depth(data: Any) -> None:
+    """Raise ValueError for tables or lists deeper than any settings."""
+    level = [data]
+    for _ in range(_MAX_DEPTH):
+        parts = [part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list)]
+        level = [part for group in parts for part in group]
+        if not level:
+            return
+    raise ValueError(f"tables nested deeper than {_MAX_DEPTH}")
 
 
 def _check_mode(mode: int, path: Path) -> None:

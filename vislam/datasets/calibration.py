@@ -15,20 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from vislam.core.camera import Camera, CameraSigmas, Distortion
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations
 from vislam.core.messages import Array
-from vislam.core.reading import read_text
+from vislam.core.reading import MAX_YAML_BYTES, parse_yaml, read_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.tables import check_size
 from vislam.imu import ImuNoise
 
 _LOG = logging.getLogger(__name__)
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
-MAX_YAML_BYTES = 2**18
 _MOST_OFFSET_PX = 1000.0  # more is no camera's: a file that was damaged
 _MOST_TIME_OFFSET_S = 10.0
 MODELS: dict[str, Distortion] = {
@@ -138,10 +136,10 @@ def load_yaml(path: Path) -> dict[str, Any]:
         lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
         if len(lines) < len(text.splitlines()):  # OpenCV wants no space behind a colon
             lines = [re.sub(r"^(\s*[A-Za-z_][\w.]*):(?=[\w\[\"+-])", r"\1: ", line) for line in lines]
-        data = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
+        data = parse_yaml("\n".join(lines).replace("!!opencv-matrix", ""))
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+    except ValueError as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(f"{path} cannot be read as YAML: {reason}") from error
     if not isinstance(data, dict):

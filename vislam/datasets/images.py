@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Camera
 from vislam.core.cpu import working_ahead
+from vislam.core.encoded_image import decoded, image_size
 from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8
 from vislam.core.reading import open_file, read_bytes
@@ -25,7 +26,6 @@ Stamps = NDArray[np.int64]
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-_MAX_PIXELS = 100_000_000  # of an image of unknown size; more is no camera's
 NO_DEPTH = 65535  # saturated: no sensor measures it, and several write it for "nothing measured"
 MAX_IMAGE_BYTES = 2**28  # of one image file; an uncompressed 60 megapixel image
 _SHORT_HEAD_BYTES = 2**12  # holds the size of most images
@@ -114,24 +114,6 @@ def _nearest(a_ns: Stamps, b_ns: Stamps) -> Stamps:
     return np.where(take_left, left, right).astype(np.int64)
 
 
-def image_size(head: bytes) -> tuple[int, int] | None:
-    """Return width and height that the head of a PNG or JPEG file declares, or None if it is neither."""
-    if head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR":
-        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    if not head.startswith(b"\xff\xd8"):
-        return None
-    at = 2
-    while at + 9 <= len(head) and head[at] == 0xFF:
-        marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
-        if marker == 0xFF:  # fill byte
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame, any coding
-            return int.from_bytes(head[at + 7 : at + 9], "big"), int.from_bytes(head[at + 5 : at + 7], "big")
-        else:
-            at += 2 + length
-    return None
-
-
 def probe(path: Path) -> tuple[int, int]:
     """Return width and height of an image file from its head, without decoding; raises UnreadableImageError.
 
@@ -180,13 +162,10 @@ def decode_image(data: bytes, camera: Camera, flags: int, path: Path) -> NDArray
     """
     # compared before decoding, so that a forged header cannot ask for gigabytes
     check_size_px(_checked_size(data[:_HEAD_BYTES], data[-_TAIL_BYTES:], path), camera, path)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error as error:
-        raise UnreadableImageError("unreadable image", path) from error
-    if image is None or image.shape[:2] != (camera.height, camera.width):
+    image = decoded(data, flags, (camera.width, camera.height))
+    if image is None:
         raise UnreadableImageError("unreadable image", path)
-    return np.asarray(image)
+    return image
 
 
 def check_size_px(size: tuple[int, int], camera: Camera, path: Path) -> None:
@@ -213,8 +192,6 @@ def read_any_size(path: Path) -> ImageU8 | None:
     """Return a grey image of whatever size its file has; None if it cannot be read, or is larger than any camera's."""
     try:
         width, height = probe(path)
-        if width * height > _MAX_PIXELS:
-            return None
         return read_grey_or_color(path, Camera(width, height, 1.0, 1.0, 0.0, 0.0))[0]
     except (UnreadableImageError, DataError):
         return None

@@ -8,7 +8,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from vislam.config.ranges import Count, Whole
+from vislam.config.ranges import Few, Whole
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class CompareOptions:
     interpreter that has pyorbslam3 or depthai; vislam installs neither; docs/experiments.md"""
     out: Path | None = None
     """Folder for report, tables and manifest; None: results/NAME of the plan"""
-    workers: Count = 2
+    workers: Few = 2
     """Jobs at the same time on this machine; 1 for undisturbed timings"""
     engine: Literal["local", "dask", "slurm"] = "local"
     """Processes of this machine, the workers of a Dask cluster, or an array of Slurm's"""

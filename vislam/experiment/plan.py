@@ -6,7 +6,6 @@ import dataclasses
 import json
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from vislam.config import validated
 from vislam.core.errors import UsageError
-from vislam.core.reading import read_text
+from vislam.core.reading import parse_toml, read_text
 from vislam.experiment import commands, peers
 from vislam.experiment.recordings import is_on_disk
 from vislam.runs.sources import is_world, split_source
@@ -142,8 +141,8 @@ def load_plan(
         UsageError: naming the file, the field, what was asked and what is allowed.
     """
     try:
-        data = tomllib.loads(plan_text(path, programs, known))
-    except (ValueError, RecursionError) as error:
+        data = parse_toml(plan_text(path, programs, known))
+    except ValueError as error:
         raise UsageError(_unreadable(path, error)) from error
     return plan_from_data(data, str(path), path.resolve().parent, os.environ if variables is None else variables)
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import random
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from vislam.core.errors import DataError, UsageError
-from vislam.core.reading import read_json
+from vislam.core.reading import parse_toml, read_json
 from vislam.experiment.identity import environment
 from vislam.experiment.jobs import Job, source_identities
 from vislam.experiment.plan import Plan
@@ -39,7 +38,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
         data = read_json(file)
     except (OSError, ValueError) as error:
         raise DataError(f"{file} cannot be read: {error}; give what `vislam compare` wrote") from error
-    if not isinstance(data, dict) or not isinstance(data.get("results"), list) or "plan_text" not in data:
+    asked = {"results": list, "plan_text": str}
+    if not isinstance(data, dict) or not all(isinstance(data.get(key), kind) for key, kind in asked.items()):
         raise DataError(f"{file} is no manifest of a comparison; give what `vislam compare` wrote")
     return data
 
@@ -56,7 +56,7 @@ def verify(
         UsageError: the manifest is of another plan.
         DataError: the recordings are not those of the comparison.
     """
-    if tomllib.loads(manifest["plan_text"]) != tomllib.loads(plan_text):
+    if parse_toml(manifest["plan_text"]) != parse_toml(plan_text):
         raise UsageError("the manifest is that of another plan, or the plan was changed since; give the plan it is of")
     for name, identity in source_identities(jobs).items():
         if manifest["sources"].get(name) != identity:

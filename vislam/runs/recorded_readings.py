@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import socket
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import numpy as np
 
 from vislam.core.errors import UsageError
 from vislam.core.files import write_text
+from vislam.core.reading import read_toml
 from vislam.core.readings import Reading
 from vislam.datasets.recorder import Recorder
 from vislam.hw.reading_port import check_port
@@ -79,7 +79,7 @@ def further_ports(path: Path, open_ports: OpenPorts) -> FurtherPorts:
         raise UsageError(
             f"{path}: [sensors.{missing[0]}]: it needs a port to be recorded from; docs/more-sensors.md, Live"
         )
-    tables = tomllib.loads(path.read_text(encoding="utf-8"))["sensors"]
+    tables = read_toml(path)["sensors"]
     return FurtherPorts(setup, tables, open_ports)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any, Literal
 from vislam.config import SensorsConfig, validated
 from vislam.config.ranges import Count, Finite, NonNegative, Positive, Probability
 from vislam.core.errors import UsageError
-from vislam.core.reading import read_text
+from vislam.core.reading import read_toml
 from vislam.sensors.configured import Configured
 from vislam.sensors.correlated import Correlated
 from vislam.sensors.geodetic import Geodetic, why_nowhere
@@ -25,7 +24,6 @@ from vislam.sensors.suite import Suite
 from vislam.sensors.ticks import TicksSettings
 
 MOST_SENSORS = 64
-_MOST_BYTES = 2**20
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 FileFormat = Literal["csv", "nmea", "ubx", "bag", "gpmf"]
 BRIDGE = "bridge"  # in place of a port: the board that has the IMU
@@ -120,8 +118,8 @@ def load_sensor_setup(path: Path) -> SensorSetup:
     Raises UsageError in one line: file, table, key, what was asked and what was found.
     """
     try:
-        data = tomllib.loads(read_text(path, _MOST_BYTES))
-    except (OSError, ValueError, RecursionError) as error:
+        data = read_toml(path)
+    except (OSError, ValueError) as error:
         raise UsageError(f"sensors {path} cannot be read: {error}; see docs/more-sensors.md for an example") from error
     return sensor_setup(data, str(path), path.parent)
 

@@ -10,7 +10,7 @@ from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.results import print_metrics
 from vislam.cli.verbs.run import RunOptions, run_options
 from vislam.config import Config
-from vislam.config.ranges import Whole
+from vislam.config.ranges import Seed
 
 _CAMERA_HZ = 10  # rendering takes most of the demo's time
 
@@ -23,7 +23,7 @@ class DemoOptions:
     """Folder for the run; a run that it holds is replaced"""
     world: str = "workshop-cart"
     """Simulated world"""
-    seed: Whole = 0
+    seed: Seed = 0
     """Of the world and of the pipeline"""
 
 

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import GraphWorldConfig
-from vislam.config.ranges import Count, NonNegative, Positive, Whole
+from vislam.config.ranges import Count, Few, NonNegative, Positive, Seed
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class SimulateOptions:
     """Rolling shutter: time from the first to the last row"""
     labels: bool = False
     """Write what each pixel shows into OUT/labels, too, for --map.labels.folder of `run`"""
-    workers: Count = 2
+    workers: Few = 2
     """Threads that render; they change nothing but the time"""
-    seed: Whole = 0
+    seed: Seed = 0
     """Of motion and sensors; same seed, same bytes"""
-    world_seed: Whole = 0
+    world_seed: Seed = 0
     """Of the place: its textures, and where things stand"""
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from vislam.config.ranges import Count
+from vislam.config.ranges import Few
 from vislam.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ class SolvingOptions:
 
     engine: Literal["local", "dask"] = "local"
     """As a whole in this process, or in overlapping domains by the workers of a Dask cluster"""
-    workers: Count = 2
+    workers: Few = 2
     """Of --engine dask on this machine; each takes one core"""
     scheduler: str | None = None
     """Address of the Dask scheduler whose workers are to solve instead, as tcp://127.0.0.1:8786"""

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from vislam.cli.verbs.arguments import parse
-from vislam.config.ranges import Count, Range, Whole
+from vislam.config.ranges import Count, Few, Many, Range, Seed
 from vislam.core.errors import UsageError
 
 
@@ -27,13 +27,13 @@ class VocabularyOptions:
     """Use every n-th image"""
     features: Count = 1000
     """ORB descriptors per image"""
-    branching: Annotated[int, Range(2)] = 10
+    branching: Annotated[int, Range(2, 100)] = 10
     """Children of a node"""
-    depth: Count | None = None
+    depth: Few | None = None
     """Levels; None: as many as leave each word some descriptors"""
-    max_descriptors: Count = 1_000_000
+    max_descriptors: Many = 1_000_000
     """That the tree grows on, taken evenly"""
-    seed: Whole = 0
+    seed: Seed = 0
     """Same seed, same bytes"""
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.camera import Camera
+from vislam.core.encoded_image import image_size
 from vislam.core.messages import ImageF32, ImageU8
-from vislam.datasets.images import DepthFormat, UnreadableImageError, check_size_px, decode_image, image_size
+from vislam.datasets.images import DepthFormat, UnreadableImageError, check_size_px, decode_image
 
 _DEPTH_UNITS_PER_M = 1000.0  # as ROS defines 16UC1
 _DEPTH_HEAD = struct.Struct("<iff")  # of `compressedDepth`: kind, and what turns its numbers into an inverse depth

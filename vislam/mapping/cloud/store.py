@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import zlib
 from dataclasses import dataclass, replace
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.encoded_image import decoded
 from vislam.core.errors import DataError
 from vislam.core.memory import PackedScan
 from vislam.core.messages import ImageU8
@@ -104,9 +104,7 @@ class KeyframeStore:
         geometry = self.geometry(keyframe_id)
         points = geometry.points_body_m
         shape = (1, 0 if points is None else len(points)) if geometry.depth is None else geometry.depth.shape
-        # the header has the size, as for depth
-        is_right = len(packed.labels_png) >= 24 and struct.unpack(">II", packed.labels_png[16:24]) == shape[::-1]
-        labels = _decode(packed.labels_png, cv2.IMREAD_UNCHANGED) if is_right else None
+        labels = decoded(packed.labels_png, cv2.IMREAD_UNCHANGED, shape[::-1])
         if labels is None or labels.dtype not in (np.uint8, np.uint16) or labels.shape != shape:
             raise _damaged(keyframe_id, "its labels are no image of the size of its depth")
         ids = labels.astype(np.uint16)
@@ -119,8 +117,8 @@ class KeyframeStore:
         """
         geometry, colors = self.geometry(keyframe_id), self._packed[keyframe_id].colors
         if geometry.depth is not None:
-            bgr = _decode(colors, cv2.IMREAD_COLOR)
-            if bgr is None or bgr.shape[:2] != geometry.depth.shape:
+            bgr = decoded(colors, cv2.IMREAD_COLOR, self._size)
+            if bgr is None:
                 raise _damaged(keyframe_id, "its colours are no image of the size of its depth")
             return replace(geometry, colors=np.ascontiguousarray(np.asarray(bgr, np.uint8)[..., ::-1]))
         if geometry.points_body_m is None or len(colors) != 3 * len(geometry.points_body_m):
@@ -138,9 +136,7 @@ class KeyframeStore:
         """
         packed, none = self._packed[keyframe_id], np.zeros((0, 3), np.uint8)
         if packed.depth_png:
-            # the header has the size: no memory is taken for an image that cannot be one of ours
-            size = struct.unpack(">II", packed.depth_png[16:24]) if len(packed.depth_png) >= 24 else None
-            depth = _decode(packed.depth_png, cv2.IMREAD_UNCHANGED) if size == self._size else None
+            depth = decoded(packed.depth_png, cv2.IMREAD_UNCHANGED, self._size)
             if depth is None or depth.dtype != np.uint16 or depth.shape != self._size[::-1]:
                 raise _damaged(keyframe_id, "its depth is no image of 16 bits of {} x {}".format(*self._size))
             return Scan(np.asarray(depth, np.uint16), None, none)
@@ -166,15 +162,6 @@ def packed_labels(labels: NDArray[np.uint16] | None) -> bytes:
 
 def _damaged(keyframe_id: int, why: str) -> DataError:
     return DataError(f"what is stored of keyframe {keyframe_id} is damaged: {why}; run the recording again")
-
-
-def _decode(data: bytes, kind: int) -> NDArray[np.generic] | None:
-    """Return an image, None when it is not one."""
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
-    except cv2.error:  # of no bytes, or of an absurd size
-        return None
-    return None if image is None else np.asarray(image)
 
 
 def _encode(kind: str, image: NDArray[np.generic], options: list[int]) -> bytes:

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.files import replacing
 from vislam.core.jit import njit
-from vislam.core.reading import read_bytes, read_text
+from vislam.core.reading import parse_yaml, read_bytes, read_text
 from vislam.mapping.octree import OctreeLeaves
 
 _OCCUPIED_SHADE, _FREE_SHADE, _UNKNOWN_SHADE = 0, 254, 205  # map_saver's
@@ -110,11 +109,11 @@ def read_grid(folder: Path, name: str = "grid") -> GridImage:
     """Return what `write_grid` wrote as `NAME.pgm` and `NAME.yaml`; raises DataError when they are something else."""
     image, description = folder / f"{name}.pgm", folder / f"{name}.yaml"
     try:
-        described = yaml.safe_load(read_text(description, _MAX_DESCRIPTION_BYTES))
+        described = parse_yaml(read_text(description, _MAX_DESCRIPTION_BYTES))
         resolution, origin = float(described["resolution"]), [float(value) for value in described["origin"]]
         if not (np.isfinite([resolution, *origin]).all() and resolution > 0.0 and len(origin) == 3):
             raise ValueError("resolution or origin cannot be")
-    except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(f"{description} cannot be used: {reason}; `vislam map RUN` writes it again") from error
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
-from vislam.core.reading import read_text
+from vislam.core.reading import read_toml
 
 UNLABELLED = 0  # the id without a meaning
 MAX_ID = 65535
 FILE_NAME = "labels.toml"
 _MAX_CLASSES = 4096
 _MAX_NAME = 100  # letters
-_MAX_BYTES = 2**20
 _GOLDEN = 0.618033988749895  # neighbouring ids get hues far apart
 
 Color = tuple[int, int, int]
@@ -62,14 +60,14 @@ class LabelClasses:
         Raises DataError when it cannot be used.
         """
         try:
-            data = tomllib.loads(read_text(path, _MAX_BYTES))
+            data = read_toml(path)
         except FileNotFoundError as error:
             raise DataError(
                 f'{path} is not there; write what the ids in the label images mean, a line each, such as 3 = "door"'
             ) from error
         except OSError as error:
             raise DataError(f"{path} cannot be read: {error.strerror}") from error
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             raise DataError(f"{path} is no TOML: {error}") from error
         return cls.of(data, str(path))
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.camera import Camera, Rig
+from vislam.core.encoded_image import decoded
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame
 from vislam.core.reading import read_bytes
@@ -171,11 +172,9 @@ def read_labels(path: Path, camera: Camera) -> Labels:
         raise DataError(f"{path} is no grey PNG of 8 or 16 bits: store the ids themselves, not colours or a palette")
     try:
         _check_size((int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")), camera)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
-    except cv2.error:
-        image = None
+    image = decoded(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or b"IEND" not in data[-1024:]:
         raise DataError(f"{path} is damaged or cut")
     return np.asarray(image, dtype=np.uint16)

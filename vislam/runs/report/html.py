@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vislam.core.reading import read_bytes
 
 _MAX_PICTURE_PX = 1600
-_KEEP_BYTES = 400_000  # a smaller picture is embedded as it is
+_KEEP_BYTES = 400_000  # a smaller PNG stays one
 _MAX_PICTURE_BYTES = 64 * 2**20
-_MAX_PIXELS = 64 * 10**6  # what a forged header may claim
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,21 +132,20 @@ def picture(path: Path, caption: str, kind: str = "") -> str:
     """
     import cv2
 
-    from vislam.datasets.images import image_size
+    from vislam.core.encoded_image import decoded
 
     try:
         data = read_bytes(path, _MAX_PICTURE_BYTES)
     except OSError as error:
         return card(note(f"{path.name} cannot be read: {error.strerror or error}"))
-    mime = "image/png" if path.suffix == ".png" else "image/jpeg"
-    if len(data) > _KEEP_BYTES:
-        width, height = image_size(data) or (0, 0)
-        fits = 0 < width * height <= _MAX_PIXELS
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if fits else None
-        if image is None:
-            return card(note(f"{path.name} is not a readable image"))
-        scale = min(1.0, _MAX_PICTURE_PX / max(image.shape[:2]))
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
-        data, mime = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes(), "image/jpeg"
+    image = decoded(data, cv2.IMREAD_COLOR)
+    if image is None:
+        return card(note(f"{path.name} is not a readable image"))
+    # written anew: no byte of the file itself leaves, which may be a link to anything
+    keeps = len(data) <= _KEEP_BYTES and path.suffix == ".png"
+    scale = 1.0 if keeps else min(1.0, _MAX_PICTURE_PX / max(image.shape[:2]))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
+    suffix, options = (".png", []) if keeps else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 90])
+    data, mime = cv2.imencode(suffix, small, options)[1].tobytes(), "image/png" if keeps else "image/jpeg"
     encoded = base64.b64encode(data).decode("ascii")
     return card(f'<img alt="{escape(caption)}" src="data:{mime};base64,{encoded}">', title=caption, kind=kind)

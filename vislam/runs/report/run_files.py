@@ -57,6 +57,10 @@ class RunFiles:
         """Whether the run had one."""
         return self.metrics.get("mode") != "none"
 
+    def has(self, name: str) -> bool:
+        """Return whether a file is in the folder; a link that leads out of it is none, and stands in `unread`."""
+        return _belongs(self.folder / name, self.folder, self.unread)
+
 
 def read_run(folder: Path) -> RunFiles:
     """Read a run folder. Raises DataError when it is no folder or holds nothing of a run."""
@@ -66,7 +70,7 @@ def read_run(folder: Path) -> RunFiles:
 
     def attempt(name: str, read: Callable[[Path], T]) -> T | None:
         path = folder / name
-        if not path.is_file():
+        if not _belongs(path, folder, unread):
             return None
         try:
             return read(path)
@@ -78,6 +82,10 @@ def read_run(folder: Path) -> RunFiles:
 
     found = {name: attempt(f"trajectory_{name}.tum", read_tum) for name in ESTIMATES}
     states = {name: attempt(f"states_{name}.csv", read_states_csv) for name in ("ekf", "graph")}
+    loop_pictures, pictures = (
+        [path for path in sorted((folder / place).glob(names)) if _belongs(path, folder, unread)]
+        for place, names in (("loops", "*.jpg"), ("map", "picture*.png"))
+    )
     run = RunFiles(
         folder=folder,
         metrics=attempt("metrics.json", _read_json) or {},
@@ -89,13 +97,23 @@ def read_run(folder: Path) -> RunFiles:
         loops_eval=attempt("loops_eval.json", _read_json) or {},
         loops=attempt("loops.csv", read_loops) or [],
         tracking=attempt("tracking.csv", _read_tracking),
-        loop_pictures=sorted((folder / "loops").glob("*.jpg"))[:_MAX_LOOP_PICTURES],
-        pictures=sorted((folder / "map").glob("picture*.png")),
+        loop_pictures=loop_pictures[:_MAX_LOOP_PICTURES],
+        pictures=pictures,
         unread=unread,
     )
     if not run.metrics and not run.estimates and not unread:
         raise DataError(f"{folder} holds neither metrics.json nor a trajectory; is it a run folder?")
     return run
+
+
+def _belongs(path: Path, folder: Path, unread: dict[str, str]) -> bool:
+    """Return whether a file is there and lies in the folder: a report is passed on with what it was made of."""
+    if not path.is_file():
+        return False
+    inside = path.resolve().is_relative_to(folder.resolve())
+    if not inside:
+        unread[str(path.relative_to(folder))] = f"{path} is a link that leads out of the run folder"
+    return inside
 
 
 def _read_json(path: Path) -> dict[str, Any]:

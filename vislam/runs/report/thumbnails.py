@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.encoded_image import decoded
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.images import image_size
 from vislam.factors import rig_from
 from vislam.runs.report.run_files import RunFiles
 from vislam.runs.session import Session
@@ -21,7 +21,6 @@ _MAX_BYTES = 1_200_000  # of all of them
 _WIDTH_PX = 240
 _QUALITY = 55
 _MAX_STORED_BYTES = 4 * 2**20  # of one stored picture
-_MAX_PIXELS = 16 * 10**6  # what a forged header may claim
 _MAX_SESSION_BYTES = 2**30  # of a larger one no pictures are taken: checking it would take longer than the report
 
 
@@ -37,7 +36,7 @@ class Thumbnails:
 def read_thumbnails(run: RunFiles) -> Thumbnails:
     """Return what the session of a run has to show; nothing, with the reason in `run.unread`, when it is damaged."""
     path = run.folder / "session.db"
-    if not path.is_file():
+    if not run.has(path.name):
         return Thumbnails()
     try:
         if path.stat().st_size > _MAX_SESSION_BYTES:
@@ -77,10 +76,7 @@ def _of_session(session: Session) -> Thumbnails:
 
 def _small(data: bytes) -> bytes | None:
     """Return a stored picture made small; None when it is none, or claims to be larger than any camera's."""
-    width, height = image_size(data) or (0, 0)
-    if not 0 < width * height <= _MAX_PIXELS:
-        return None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    image = decoded(data, cv2.IMREAD_COLOR)
     if image is None:
         return None
     scale = _WIDTH_PX / image.shape[1]

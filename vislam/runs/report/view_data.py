@@ -129,7 +129,7 @@ def _loops(run: RunFiles, scene: Scene) -> dict[str, Any]:
 def _cloud(run: RunFiles, scene: Scene) -> dict[str, Any]:
     """Return the map's points in an order of which every beginning is an even sample of the whole."""
     path = run.folder / "map" / "cloud.ply"
-    if not path.is_file():
+    if not run.has(f"map/{path.name}"):
         return {}
     try:
         if path.stat().st_size > _MAX_CLOUD_BYTES:
@@ -177,7 +177,7 @@ def label_data(run: RunFiles, scene: Scene, most: int = MAX_VOXELS) -> dict[str,
     What cannot be read is left out and named in `run.unread`.
     """
     folder = run.folder / "map"
-    if not (folder / CLASSES_NAME).is_file():
+    if not run.has(f"map/{CLASSES_NAME}"):
         return {}
     try:
         layer = read_layer(folder)
