@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import random
 import resource
 import sqlite3
@@ -20,7 +21,7 @@ from vislam.core.errors import DataError, VislamError
 from vislam.core.messages import Frame
 from vislam.datasets import open_dataset
 from vislam.datasets.bags.bag import Bag
-from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES
+from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, FileBytes
 from vislam.datasets.inspect import inspect
 from worlds.bag_writer import Message, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, HEIGHT, WIDTH, picture
@@ -366,6 +367,56 @@ def test_mutated_bags_are_read_or_refused_in_one_line(kind: str, tmp_path: Path)
         play(path)
 
     mutate()
+
+
+def rosbag_chunk(records: bytes, packed: bytes, method: bytes) -> bytes:
+    fields = (b"op=\x05", b"compression=" + method, b"size=" + struct.pack("<I", len(records)))
+    head = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+    return struct.pack("<I", len(head)) + head + struct.pack("<I", len(packed)) + packed
+
+
+def mcap_chunk(records: bytes, packed: bytes, method: bytes) -> bytes:
+    head = struct.pack("<QQQII", 0, 0, len(records), 0, len(method)) + method + struct.pack("<Q", len(packed))
+    return struct.pack("<BQ", 6, len(head) + len(packed)) + head + packed
+
+
+UNKNOWN = b"\x08\0\0\0\x04\0\0\0op=\x63\0\0\0\0"  # a record of rosbag 1 of a kind that is none
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b"#ROSBAG V2.0\n" + rosbag_chunk(UNKNOWN * 10**6, bz2.compress(UNKNOWN * 10**6), b"bz2"), "records"),
+        (b"#ROSBAG V2.0\n" + rosbag_chunk(UNKNOWN * 10**6, lz4.frame.compress(UNKNOWN * 10**6), b"lz4"), "records"),
+        (MCAP_MAGIC + mcap_chunk(b"\x63" + bytes(8), lz4.frame.compress((b"\x63" + bytes(8)) * 10**6), b"lz4"), ""),
+        (b"#ROSBAG V2.0\n" + rosbag_chunk(bytes(2**27), bz2.compress(bytes(2**27)), b"bz2") * 9, "unpacked bytes"),
+    ],
+    ids=["bz2", "lz4", "more than stated", "many chunks"],
+)
+def test_a_packed_bag_cannot_ask_for_far_more_than_its_size(data: bytes, what: str, tmp_path: Path) -> None:
+    path = tmp_path / ("a.bag" if data.startswith(b"#") else "a.mcap")
+    path.write_bytes(data)
+    problems = Problems()
+    if what:
+        with pytest.raises(DataError, match=f"asks for far more {what} than its size justifies"):
+            list(Bag(path).scan(problems))
+    else:
+        assert list(Bag(path).scan(problems)) == [] and problems
+
+
+def test_the_index_is_read_once_for_all_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chunk, count = mcap_chunk(b"", b"\x05", b""), 300
+    places = [len(MCAP_MAGIC) + i * len(chunk) for i in range(count)]
+    body = MCAP_MAGIC + chunk * count + struct.pack("<BQ", 15, 4) + bytes(4)
+    index = b"".join(struct.pack("<BQQQQ", 8, 64, 0, 0, place) + bytes(40) for place in places)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(body + index + struct.pack("<BQQQI", 2, 20, len(body), 0, 0) + MCAP_MAGIC)
+    reads, read = [], FileBytes.read
+    monkeypatch.setattr(FileBytes, "read", lambda self, at, length: reads.append(at) or read(self, at, length))
+    problems = Problems()
+    assert list(Bag(path).scan(problems)) == []
+    assert sum(problems.values()) >= count
+    assert len(reads) < 12 * count
 
 
 def test_memory_does_not_grow_with_the_length_of_a_bag(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
+from vislam.core.errors import DataError
+
 _MAX_JSON_BYTES = 256 * 2**20  # metrics of the longest runs come to a tenth
 _POINTER, _MAX_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
 _MAX_TEXT_BYTES = 16 * 2**20  # settings, plans, calibrations
@@ -27,6 +29,23 @@ _FREE_NODES = 10_000  # of YAML, beside one for each byte: what aliases and merg
 _MAX_DOTS = 100  # in a line of TOML: work and memory go with the square of a dotted key's parts
 _MAX_DEPTH = 64  # of tables within tables
 _MAX_SCALAR = 2**15  # characters: 1:1:1... is a number to base 60, whose work goes with the square
+
+
+class Budget:
+    """What may come out of one file, by its size: a dark camera's packed images may be a gigabyte, a bomb is more."""
+
+    def __init__(self, path: Path, size_bytes: int) -> None:
+        """Begin with all that a file of `size_bytes` justifies."""
+        self._path = path
+        self._records, self._bytes = 500_000 + size_bytes // 8, 2**30 + 100 * size_bytes
+
+    def take(self, records: int = 1, unpacked_bytes: int = 0) -> None:
+        """Count what was met, however often; raises DataError beyond what is justified."""
+        self._records -= records
+        self._bytes -= unpacked_bytes
+        if self._records < 0 or self._bytes < 0:
+            what = "records" if self._records < 0 else "unpacked bytes"
+            raise DataError(f"{self._path} asks for far more {what} than its size justifies; convert it again")
 
 
 def open_file(path: Path) -> BufferedReader:

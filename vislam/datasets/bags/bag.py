@@ -72,7 +72,8 @@ class Bag:
 
     def _with_unpacked_head(self, found: Found) -> Found:
         try:
-            return found._replace(head=self.read(found.place)[:HEAD_BYTES])
+            packed = self._containers[found.place.file].read(found.place)
+            return found._replace(head=unpacked_message(packed, HEAD_BYTES))
         except (DamagedError, OSError):
             return found._replace(head=b"")  # counted where it is decoded
 

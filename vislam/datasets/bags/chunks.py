@@ -96,10 +96,9 @@ class ChunkedFile(abc.ABC):
             if at in self._kept:
                 self._kept.move_to_end(at)
                 return self._kept[at]
-            data = self._unpack(at)
-            self._kept[at] = data
-            while len(self._kept) > 1 and sum(len(kept) for kept, _ in self._kept.values()) > _KEPT_BYTES:
-                self._kept.popitem(last=False)
+            while sum(len(kept) for kept, _ in self._kept.values()) > _KEPT_BYTES:
+                self._kept.popitem(last=False)  # before the next is unpacked: both may be large
+            data = self._kept[at] = self._unpack(at)
             return data
 
     def _unpacked(self, at: int, length: int, method: str, declared: int) -> tuple[bytes, bool]:
@@ -127,10 +126,10 @@ def unpacked(data: bytes, method: str, declared: int) -> tuple[bytes, bool]:
     return out, len(out) == declared
 
 
-def unpacked_message(data: bytes) -> bytes:
-    """Return a message that a recorder packed by zstd for itself; raises DamagedError."""
+def unpacked_message(data: bytes, head_bytes: int | None = None) -> bytes:
+    """Return a message that a recorder packed by zstd for itself, or its first bytes; raises DamagedError."""
     try:
-        out: bytes = _decompressor("zstd").decompress(data, MOST_MESSAGE_BYTES + 1)
+        out: bytes = _decompressor("zstd").decompress(data, head_bytes or MOST_MESSAGE_BYTES + 1)
     except _errors("zstd") as error:
         raise DamagedError(f"message that cannot be unpacked: {error}") from error
     if len(out) > MOST_MESSAGE_BYTES:

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import re
 import struct
+from bisect import bisect_left
 from collections.abc import Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 from vislam.core.errors import DataError
+from vislam.core.reading import Budget
 from vislam.core.recording import Problems
 from vislam.datasets.bags import foxglove
 from vislam.datasets.bags.chunks import MOST_CHUNK_BYTES, Bytes, ChunkedFile, FileBytes
@@ -35,7 +38,7 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _METHODS = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")  # in the head of a packed chunk
-_BLOCK_BYTES = 2**20
+_BLOCK_BYTES = 2**16
 _MOST_HEAD_BYTES = _CHUNK_HEAD.size + 32 + 8
 
 
@@ -47,10 +50,11 @@ class _Schema(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What was announced so far."""
+    """What was announced so far, and what may still come."""
 
     schemas: dict[int, _Schema]
     topics: dict[int, Topic]
+    budget: Budget
 
 
 class _Chunk(NamedTuple):
@@ -69,9 +73,10 @@ class Mcap(ChunkedFile):
         """Yield the messages in the order in which they were stored; raises DataError when it is no MCAP file."""
         if self._bytes.read(0, len(MAGIC)) != MAGIC:
             raise DataError(f"{self._path} is no MCAP file: it does not begin as one")
-        known = _Known({}, {})
+        known = _Known({}, {}, Budget(self._path, self._bytes.size))
         at = len(MAGIC)
         while at < self._bytes.size:
+            known.budget.take()
             try:
                 op, data_at, length = _record(self._bytes, at)
                 if op in (_DATA_END, _FOOTER):
@@ -97,6 +102,7 @@ class Mcap(ChunkedFile):
             yield from _walk(self._bytes, chunk.at, end, (self._file, -1), known)
             return
         data, whole = self._chunk_at(at)
+        known.budget.take(0, len(data))
         yield from _walk(Bytes(data), 0, len(data), (self._file, at), known)
         if not whole:
             problems.count(f"{self._path.name}: chunk that cannot be unpacked to its end", f"byte {at}")
@@ -110,9 +116,9 @@ class Mcap(ChunkedFile):
 
         Without an index only packed chunks are found.
         """
-        indexed = [begin for begin in self._indexed_chunks() if begin >= at and self._is_chunk(begin)]
-        if indexed:
-            return min(indexed)
+        later = bisect_left(self._indexed, at)
+        if later < len(self._indexed):
+            return self._indexed[later]
         before = _RECORD.size + _CHUNK_HEAD.size - 4  # in front of the name of its method
         while at < self._bytes.size:
             block = self._bytes.fetch(at, _BLOCK_BYTES)
@@ -122,6 +128,11 @@ class Mcap(ChunkedFile):
                     return begin
             at += len(block) - before - 8 if len(block) == _BLOCK_BYTES else len(block)
         return self._bytes.size
+
+    @cached_property
+    def _indexed(self) -> list[int]:
+        """Where chunks begin by the index, rising: read once, however often the file is damaged."""
+        return [begin for begin in sorted(set(self._indexed_chunks())) if self._is_chunk(begin)]
 
     def _indexed_chunks(self) -> Iterator[int]:
         """Yield where chunks begin by the index at the file's end, as far as it can be read."""
@@ -151,8 +162,9 @@ class Mcap(ChunkedFile):
 
 
 def _walk(reader: Bytes | FileBytes, at: int, end: int, origin: tuple[int, int], known: _Known) -> Iterator[Found]:
-    """Yield the messages in an unpacked chunk; raises DamagedError."""
+    """Yield the messages in an unpacked chunk; raises DamagedError, and DataError where its records are too many."""
     while at < end:
+        known.budget.take()
         op, data_at, length = _record(reader, at)
         if data_at + length > end:
             raise DamagedError("message cut short")

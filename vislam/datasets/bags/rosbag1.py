@@ -11,6 +11,7 @@ import struct
 from collections.abc import Iterator
 
 from vislam.core.errors import DataError
+from vislam.core.reading import Budget
 from vislam.core.recording import Problems
 from vislam.datasets.bags.chunks import Bytes, ChunkedFile, FileBytes
 from vislam.datasets.bags.stored import (
@@ -30,7 +31,7 @@ _KNOWN = frozenset((2, 3, 4, 5, 6, 7))
 _MOST_HEADER_BYTES = 2**16
 _MOST_DEFINITION_BYTES = 2**22
 _MARK = b"\x04\x00\x00\x00op=\x05"  # in the header of every chunk
-_BLOCK_BYTES = 2**20
+_BLOCK_BYTES = 2**16
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 Fields = dict[bytes, bytes]
@@ -44,14 +45,16 @@ class Rosbag1(ChunkedFile):
         if self._bytes.read(0, len(MAGIC)) != MAGIC:
             raise DataError(f"{self._path} is no rosbag of format 2.0; `rosbag migrate` converts older ones")
         topics: dict[int, Topic] = {}
+        budget = Budget(self._path, self._bytes.size)
         at = len(MAGIC)
         while at < self._bytes.size:
+            budget.take()
             try:
                 fields, data_at, length = _record(self._bytes, at)
                 if _op(fields) not in _KNOWN:
                     raise DamagedError("record of an unknown kind")
                 if _op(fields) == _CHUNK:
-                    yield from self._chunk(at, fields, data_at, length, topics, problems)
+                    yield from self._chunk(at, fields, (data_at, length), topics, budget, problems)
                 else:
                     yield from _one(self._bytes, fields, (data_at, length), (self._file, -1), topics)
                 if data_at + length > self._bytes.size:
@@ -62,14 +65,21 @@ class Rosbag1(ChunkedFile):
                 at = self._next_chunk(at + 1)
 
     def _chunk(
-        self, at: int, fields: Fields, data_at: int, length: int, topics: dict[int, Topic], problems: Problems
+        self,
+        at: int,
+        fields: Fields,
+        data: tuple[int, int],
+        topics: dict[int, Topic],
+        budget: Budget,
+        problems: Problems,
     ) -> Iterator[Found]:
         if fields.get(b"compression") == b"none":
-            end = min(data_at + length, self._bytes.size)
-            yield from _walk(self._bytes, data_at, end, (self._file, -1), topics)
+            end = min(sum(data), self._bytes.size)
+            yield from _walk(self._bytes, data[0], end, (self._file, -1), topics, budget)
             return
-        data, whole = self._chunk_at(at)
-        yield from _walk(Bytes(data), 0, len(data), (self._file, at), topics)
+        unpacked, whole = self._chunk_at(at)
+        budget.take(0, len(unpacked))
+        yield from _walk(Bytes(unpacked), 0, len(unpacked), (self._file, at), topics, budget)
         if not whole:
             problems.count(f"{self._path.name}: chunk that cannot be unpacked to its end", f"byte {at}")
 
@@ -85,11 +95,10 @@ class Rosbag1(ChunkedFile):
             block = self._bytes.fetch(at, _BLOCK_BYTES)
             for match in re.finditer(re.escape(_MARK), block):
                 head = block[max(0, match.start() - 100) : match.start()]
-                for back in range(len(head), 3, -1):  # its header begins with its own length
-                    begin = at + match.start() - back
-                    length = head[len(head) - back : len(head) - back + 4]
-                    if length.endswith(b"\0\0\0") and self._is_chunk(begin):
-                        return begin
+                for zeros in re.finditer(rb"(?<=.)(?=\0\0\0)", head, re.DOTALL):
+                    back = len(head) - zeros.start() + 1  # its header begins with its own length, the mark is within
+                    if head[-back] >= back + 4 and self._is_chunk(at + match.start() - back):
+                        return at + match.start() - back
             at += len(block) - 200 if len(block) == _BLOCK_BYTES else len(block)
         return self._bytes.size
 
@@ -102,10 +111,11 @@ class Rosbag1(ChunkedFile):
 
 
 def _walk(
-    reader: Bytes | FileBytes, at: int, end: int, origin: tuple[int, int], topics: dict[int, Topic]
+    reader: Bytes | FileBytes, at: int, end: int, origin: tuple[int, int], topics: dict[int, Topic], budget: Budget
 ) -> Iterator[Found]:
-    """Yield the messages in an unpacked chunk; raises DamagedError."""
+    """Yield the messages in an unpacked chunk; raises DamagedError, and DataError where its records are too many."""
     while at < end:
+        budget.take()
         fields, data_at, length = _record(reader, at)
         if data_at + length > end:
             raise DamagedError("message cut short")
