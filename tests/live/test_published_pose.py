@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
+import stat
 import subprocess
 import time
 import uuid
@@ -14,12 +17,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.core.errors import DataError, UsageError
+from vislam.core.errors import DataError, StorageError, UsageError
 from vislam.core.geometry import se3_exp, so3_exp, so3_log, transform
 from vislam.core.messages import NavState
 from vislam.hw.health import Health
 from vislam.live.wire.published_pose import HEADER, LAYOUT, SIZE, PublishedPose, of_base, pack, unpack
-from vislam.live.wire.publisher import PoseListener, PosePublisher, PoseReader
+from vislam.live.wire.publisher import PoseListener, PosePublisher, PoseReader, socket_path
 from vislam.live.wire.slot import SlotReader, SlotWriter
 
 
@@ -70,18 +73,15 @@ def test_garbage_is_refused(data: bytes) -> None:
 
 _PROGRAM = r"""
 #include <stdio.h>
-#include <fcntl.h>
-#include <sys/mman.h>
-#include <unistd.h>
 #include "vislam_pose.h"
 _Static_assert(sizeof(vislam_pose) == 256, "size");
 #define FIELD(name) printf("%zu ", offsetof(vislam_pose, name));
 int main(int count, char **path) {
     FIELDS
     printf("\n");
-    int file = open(path[1], O_RDONLY);
-    const vislam_pose_slot *slot = mmap(NULL, sizeof *slot, PROT_READ, MAP_SHARED, file, 0);
+    const vislam_pose_slot *slot = vislam_pose_open(path[1]);
     vislam_pose pose;
+    if (slot == NULL) return 3;
     if (!vislam_pose_read(slot, &pose)) return 2;
     printf("%u %.17g %.9g %u %lld\n", pose.sequence, pose.position_m[1], pose.pose_covariance[20], pose.health,
            (long long)pose.stamp_sample_ns);
@@ -102,6 +102,10 @@ def test_the_c_header_reads_what_is_published(tmp_path: Path) -> None:
     try:
         publisher.publish(pose)
         done = subprocess.run([str(program), f"/dev/shm/{name}"], check=True, capture_output=True, text=True)
+        if os.geteuid() == 0:
+            os.chown(f"/dev/shm/{name}", 54321, -1)
+            assert subprocess.run([str(program), f"/dev/shm/{name}"], check=False).returncode == 3
+        assert subprocess.run([str(program), f"/dev/shm/{name}-none"], check=False).returncode == 3
     finally:
         publisher.close()
     offsets, values = done.stdout.splitlines()
@@ -187,6 +191,53 @@ def test_a_reader_never_sees_half_of_two_values() -> None:
         stop.set()
         writer.join(600.0)
     assert not Path(f"/dev/shm/{name}").exists()
+
+
+def test_memory_and_sockets_belong_to_their_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name, at = f"vislam-test-{uuid.uuid4().hex}", tmp_path / "a.sock"
+    writer, listener = SlotWriter(name, 8), PoseListener(f"unix:{at}")
+    try:
+        path = Path(f"/dev/shm/{name}")
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(at.stat().st_mode) == 0o600
+        writer.write(b"mine")
+        assert SlotReader(name).read() == (1, b"mine")
+        if os.geteuid() == 0:
+            os.chown(path, 54321, -1)
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+        with pytest.raises(DataError, match="is that of user"):
+            SlotReader(name)
+    finally:
+        writer.close()
+        listener.close()
+
+
+def test_poses_are_not_sent_to_who_was_first_at_a_name_in_tmp(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    name = f"vislam-test-{uuid.uuid4().hex}"
+    listener, publisher = PoseListener(f"unix:{socket_path(name)}"), PosePublisher(name)
+    try:
+        publisher.publish(random_pose())
+        assert listener.next(10.0) is not None
+        if os.geteuid() == 0:
+            os.chown(socket_path(name), 54321, -1)
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+        publisher.publish(random_pose())
+        assert listener.next(0.0) is None
+    finally:
+        publisher.close()
+        listener.close()
+
+
+def test_a_full_shared_memory_is_named_and_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    name = f"vislam-test-{uuid.uuid4().hex}"
+    with pytest.raises(StorageError, match=f"/dev/shm/{name} cannot be made: No space left.*/dev/shm is full"):
+        SlotWriter(name, 8)
+    assert list(Path("/dev/shm").glob(f"*{name}*")) == []
 
 
 def test_a_new_writer_takes_over_what_a_killed_one_left() -> None:

@@ -310,6 +310,20 @@ def test_connections_are_so_many_and_when_some_end_others_are_let_in(site: Site)
         connection.close()
 
 
+def test_idle_connections_lock_nobody_out(site: Site) -> None:
+    idle = [socket.create_connection(("127.0.0.1", site.port)) for _ in range(_MOST + 8)]
+    own: list[http.client.HTTPConnection] = []
+    try:
+        own += all_places(site)
+        assert len(own) == _MOST  # the user's own have taken the places of those that show no token
+        for connection in own:  # and keep them
+            connection.request("GET", "/state", headers={"Authorization": f"Bearer {_TOKEN}"})
+            assert connection.getresponse().status == 200
+    finally:
+        for one in (*idle, *own):
+            one.close()
+
+
 def test_tokens_are_long_and_no_two_are_alike() -> None:
     assert len({new_token() for _ in range(100)}) == 100
     assert len(new_token()) >= 32

@@ -99,33 +99,56 @@ class WebServer(ThreadingHTTPServer):
             listener: bound and listening.
             gate: decides who may ask.
             routes: what for.
-            most: connections at a time; further ones are closed at once.
+            most: connections at a time. A further one takes the place of the oldest that has shown no token, so that
+                idle ones lock nobody out; where all have shown one, it is closed at once.
             request_s: that a request may take to arrive.
         """
         super().__init__(listener.getsockname(), _Handler, bind_and_activate=False)
         self.socket.close()
         self.socket = listener
         self.gate, self.routes, self.counters, self.request_s = gate, routes, Counters(), request_s
-        self._places = threading.BoundedSemaphore(most)
+        self._most = most
+        self._open: dict[Any, bool] = {}  # connections, the oldest first, and whether each has shown the token
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread, or close it where there are too many."""
-        if not self._places.acquire(blocking=False):
+        """Serve a connection in a thread; where there are too many, one that has shown no token is closed."""
+        refused: Any = None
+        with self.counters.lock:
+            if len(self._open) >= self._most:
+                refused = next((one for one, is_known in self._open.items() if not is_known), request)
+                self._open.pop(refused, None)
+            if refused is not request:
+                self._open[request] = False
+        if refused is not None:
             self.counters.add("connections_refused")
+            with suppress(OSError):
+                refused.shutdown(socket.SHUT_RDWR)  # its thread ends by that
+        if refused is request:
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:  # no thread could be started
-            self._places.release()
+            self.forget(request)
             raise
+
+    def know(self, request: Any) -> None:
+        """Keep the place of a connection, which has shown the token."""
+        with self.counters.lock:
+            if request in self._open:
+                self._open[request] = True
+
+    def forget(self, request: Any) -> None:
+        """Free the place of a connection."""
+        with self.counters.lock:
+            self._open.pop(request, None)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Serve a connection to its end."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._places.release()
+            self.forget(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Log what a connection raised: most went away, and others need none of the rest."""
@@ -165,6 +188,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         make, public = self.server.routes.private.get(path), self.server.routes.public.get(path)
         if make is not None and self.server.gate.admits(self.headers):
+            self.server.know(self.connection)
             self._send(make(query))
         elif public is not None:
             self._send(public)
@@ -179,9 +203,11 @@ class _Handler(BaseHTTPRequestHandler):
         path, _ = self._asked()
         if path is None or not self._is_ours():
             return
-        if path == "/command" and not self.server.gate.admits(self.headers):
-            self._refuse(HTTPStatus.UNAUTHORIZED, "the token is missing")
-            return
+        if path == "/command":
+            if not self.server.gate.admits(self.headers):
+                self._refuse(HTTPStatus.UNAUTHORIZED, "the token is missing")
+                return
+            self.server.know(self.connection)
         if path not in ("/command", "/sign-in"):
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such thing")
             return

@@ -66,6 +66,7 @@ class PosePublisher:
         self._targets = [(socket.socket(family, socket.SOCK_DGRAM), address) for family, address in addresses]
         for target, _ in self._targets:
             target.setblocking(False)
+        self._usual, self._is_shared = str(socket_path(name)), "XDG_RUNTIME_DIR" not in os.environ
         self._slot = SlotWriter(name, SIZE)
 
     def publish(self, pose: PublishedPose) -> None:
@@ -75,10 +76,12 @@ class PosePublisher:
         self.counters["published"] += 1
         for target, address in self._targets:
             try:
+                if self._is_shared and address == self._usual and os.stat(address).st_uid not in (os.geteuid(), 0):
+                    continue  # whoever was first at this name in /tmp
                 target.sendto(data, address)
             except BlockingIOError:
                 self.counters["datagrams_refused"] += 1
-            except OSError:  # no listener there (yet)
+            except OSError:  # no listener there (yet), or one that is not to hear it
                 continue
 
     def close(self) -> None:
@@ -121,6 +124,8 @@ class PoseListener:
                     self._path.unlink()
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
+            if self._path is not None:  # before it has a name: nobody else may send poses to it
+                os.fchmod(self._socket.fileno(), 0o600)
             self._socket.bind(address)
         except OSError as error:
             self._socket.close()

@@ -1,13 +1,16 @@
 """A place in shared memory that holds the newest value of one writer, for any number of readers.
 
 A sequence counter before and after the value (a seqlock) shows a reader that the writer came in between; a checksum
-shows the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C.
+shows the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C. It belongs to the
+user who runs the writer: nobody else can read it, and nobody else's is read.
 """
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
+import secrets
 import struct
 import time
 import zlib
@@ -33,18 +36,21 @@ class SlotWriter:
         self._path = _FOLDER / name
         self._capacity = capacity
         self._sequence = 0
-        fresh = self._path.with_name(f".{name}.{os.getpid()}")
+        fresh = self._path.with_name(f".{name}.{os.getpid()}.{secrets.token_hex(4)}")
         try:
-            descriptor = os.open(fresh, os.O_CREAT | os.O_RDWR | os.O_TRUNC, 0o644)
+            descriptor = os.open(fresh, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o600)
             try:
-                os.ftruncate(descriptor, _HEAD.size + capacity + _TAIL.size)
+                # not ftruncate, which promises pages that a full /dev/shm lacks: writing there would kill the process
+                os.posix_fallocate(descriptor, 0, _HEAD.size + capacity + _TAIL.size)
                 self._memory = mmap.mmap(descriptor, _HEAD.size + capacity + _TAIL.size)
             finally:
                 os.close(descriptor)
             fresh.rename(self._path)  # readers of an older one keep it, and see that it gets no newer
         except OSError as error:
-            said = f"shared memory {self._path} cannot be made: {error}; choose another --live.name"
-            raise StorageError(said) from error
+            fresh.unlink(missing_ok=True)
+            is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            step = f"{_FOLDER} is full: remove what is left there" if is_full else "choose another --live.name"
+            raise StorageError(f"shared memory {self._path} cannot be made: {error.strerror}; {step}") from error
         self._inode = self._path.stat().st_ino
 
     def write(self, value: bytes | memoryview) -> None:
@@ -70,11 +76,14 @@ class SlotReader:
     """Reads what a `SlotWriter` of another process wrote last."""
 
     def __init__(self, name: str) -> None:
-        """Open `/dev/shm/NAME`. Raises DataError when it does not exist."""
+        """Open `/dev/shm/NAME`. Raises DataError when it does not exist, or is another user's."""
         path = _FOLDER / name
         try:
-            descriptor = os.open(path, os.O_RDONLY)
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
+                owner = os.fstat(descriptor).st_uid
+                if owner not in (os.geteuid(), 0):
+                    raise DataError(f"shared memory {path} is that of user {owner}, who may write anything into it")
                 self._memory = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
             finally:
                 os.close(descriptor)

@@ -9,6 +9,10 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 #define VISLAM_POSE_MAGIC 0x4F505356u /* "VSPO" */
 #define VISLAM_POSE_VERSION 1
@@ -82,6 +86,19 @@ static inline uint32_t vislam_crc32(const void *data, size_t length) {
 static inline int vislam_pose_is_sound(const vislam_pose *pose) {
     return pose->magic == VISLAM_POSE_MAGIC && pose->version == VISLAM_POSE_VERSION &&
            pose->size == sizeof(vislam_pose) && vislam_crc32(pose, offsetof(vislam_pose, crc32)) == pose->crc32;
+}
+
+/* Map /dev/shm/NAME; NULL where it is not there, too small, or of another user, who may write anything into it. */
+static inline const vislam_pose_slot *vislam_pose_open(const char *path) {
+    struct stat found;
+    void *memory = MAP_FAILED;
+    int file = open(path, O_RDONLY);
+    if (file < 0) return NULL;
+    if (fstat(file, &found) == 0 && S_ISREG(found.st_mode) && (found.st_uid == geteuid() || found.st_uid == 0) &&
+        found.st_size >= (off_t)sizeof(vislam_pose_slot))
+        memory = mmap(NULL, sizeof(vislam_pose_slot), PROT_READ, MAP_SHARED, file, 0);
+    close(file);
+    return memory == MAP_FAILED ? NULL : (const vislam_pose_slot *)memory;
 }
 
 /* Copy the newest pose out of shared memory; 0 when there is none yet, or the writer was in between (try again). */
