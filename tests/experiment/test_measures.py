@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.core.geometry import transform
 from vislam.core.messages import Frame, ImuSample, NavState
 from vislam.experiment.measures import nis_measures, output_measures

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from vislam.config import GraphConfig
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.factors.builder import of_vision
 from vislam.factors.journal import KeyframeRecord
 from vislam.factors.noise_models import cauchy, checked_covariance, conditioned, gaussian, huber, inflated

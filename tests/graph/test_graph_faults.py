@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vislam.config import GraphConfig, WindowConfig
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.core.messages import ImuSpan, KeyframePacket, LoopDecision, LoopEdge
 from vislam.factors import solvers as solver_module
 from vislam.graph import PoseGraph

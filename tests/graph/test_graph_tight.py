@@ -11,7 +11,7 @@ import pytest
 
 from session_entries import start_facts
 from vislam.config import GraphConfig, WindowConfig
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.core.geometry import invert, so3_log
 from vislam.core.memory import KeyframeEntry, LoopPlace, WindowRecord
 from vislam.core.messages import GraphUpdate, KeyframePacket, LoopDecision, NavState

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vislam.core.errors import DataError
+from vislam.core import DataError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import results

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.needs import missing
-from vislam.core.errors import DataError
+from vislam.core import DataError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
 from vislam.runs.sources import measured_inertial

@@ -328,7 +328,7 @@ def judged_turns(
 ) -> list[Finding]:
     """Judge how turns of tracks fit a gyroscope's, as `fit_turns` takes them; where they do not, the inverse is tried.
 
-    Empty where fewer than three places turn. `rows` begins anew at every call.
+    Empty where fewer than three places turn. `rows` begins again at every call.
     """
     fit = fit_turns(camera, R_body_cam, tracks, rows(), bias_rad_s)
     if fit is None:

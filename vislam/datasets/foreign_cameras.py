@@ -20,8 +20,8 @@ from vislam.core.camera import Camera, Distortion
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, rotation_from_quaternion_xyzw, transform
 from vislam.core.messages import Array
-from vislam.core.reading import read_text
-from vislam.datasets.calibration import MAX_YAML_BYTES, NOISE_KEYS, WEIGHTY, Keys, load_yaml, numbers_in
+from vislam.core.reading import MAX_YAML_BYTES, read_text
+from vislam.datasets.calibration import NOISE_KEYS, WEIGHTY, Keys, load_yaml, numbers_in
 from vislam.datasets.tables import check_size
 
 _RATIONAL = "rational_polynomial"

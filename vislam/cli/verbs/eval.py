@@ -176,8 +176,8 @@ def _print_loops(answer: dict[str, Any]) -> None:
         rows.append((name, str(stage["answers"]), str(stage["wrong"]), *numbers, interval))
     print_table(columns, rows, f"{answer['revisits']} of {answer['keyframes']} keyframes revisit a place")
     edges, rule, found = answer["edges"], answer["rule"], answer["found"]
-    for source, told in answer["proposals"].items():
-        Console().print(f"{told['near']} of {told['verified']} candidates by {source} are truly near")
+    for source, counts in answer["proposals"].items():
+        Console().print(f"{counts['near']} of {counts['verified']} candidates by {source} are truly near")
     Console().print(
         f"{found['near']} keyframes have a truly near one long before; it was retrieved at {found['retrieved']}, "
         f"proposed at {found['proposed']}, given a right pose at {found['posed']}, accepted at {found['accepted']}"

@@ -100,7 +100,7 @@ class WebServer(ThreadingHTTPServer):
             gate: decides who may ask.
             routes: what for.
             most: connections at a time. A further one takes the place of the oldest that has shown no token, so that
-                idle ones lock nobody out; where all have shown one, it is closed at once.
+                idle ones lock no user out; where all have shown one, it is closed at once.
             request_s: that a request may take to arrive.
         """
         super().__init__(listener.getsockname(), _Handler, bind_and_activate=False)

@@ -77,7 +77,7 @@ class PosePublisher:
         for target, address in self._targets:
             try:
                 if self._is_shared and address == self._usual and os.stat(address).st_uid not in (os.geteuid(), 0):
-                    continue  # whoever was first at this name in /tmp
+                    continue  # another was first at this name in /tmp
                 target.sendto(data, address)
             except BlockingIOError:
                 self.counters["datagrams_refused"] += 1
@@ -124,7 +124,7 @@ class PoseListener:
                     self._path.unlink()
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
-            if self._path is not None:  # before it has a name: nobody else may send poses to it
+            if self._path is not None:  # before it has a name: no other user may send poses to it
                 os.fchmod(self._socket.fileno(), 0o600)
             self._socket.bind(address)
         except OSError as error:

@@ -2,7 +2,7 @@
 
 A sequence counter before and after the value (a seqlock) shows a reader that the writer came in between; a checksum
 shows the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C. It belongs to the
-user who runs the writer: nobody else can read it, and nobody else's is read.
+user who runs the writer: no other can read it, and no other's is read.
 """
 
 from __future__ import annotations

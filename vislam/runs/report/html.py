@@ -141,7 +141,7 @@ def picture(path: Path, caption: str, kind: str = "") -> str:
     image = decoded(data, cv2.IMREAD_COLOR)
     if image is None:
         return card(note(f"{path.name} is not a readable image"))
-    # written anew: no byte of the file itself leaves, which may be a link to anything
+    # written again: no byte of the file itself leaves, which may be a link to anything
     keeps = len(data) <= _KEEP_BYTES and path.suffix == ".png"
     scale = 1.0 if keeps else min(1.0, _MAX_PICTURE_PX / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
