@@ -13,10 +13,7 @@ Result = TypeVar("Result")
 
 
 def on_one_blas_thread(function: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Decorate a function to compute on one thread of BLAS, as the command line does; the others return afterwards.
-
-    It costs 0.1 ms a call.
-    """
+    """Decorate a function to compute on one thread of BLAS and give the others back after it; 0.1 ms a call."""
 
     @wraps(function)
     def limited(*values: Given.args, **named: Given.kwargs) -> Result:

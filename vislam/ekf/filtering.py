@@ -55,7 +55,7 @@ class Filtering:
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._applied: list[Correction] = []  # since they were last taken
         self._applied_readings: deque[AppliedReading] = deque(maxlen=_MOST_APPLIED)  # since they were last taken
-        self._start_ns = 0
+        self._since_ns = 0  # of when the filter may hear that noise changed
         self._noise_applied = AS_MODELLED
 
     @property
@@ -65,7 +65,7 @@ class Filtering:
 
     def start(self, state: NavState, vo: VoMeasurement) -> None:
         """Start at a state in the past."""
-        self._start_ns = state.t_ns
+        self._since_ns = state.t_ns
         self.ekf.initialise(state, vo)
 
     def tear(self, vo: VoMeasurement) -> None:
@@ -80,7 +80,7 @@ class Filtering:
 
     def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""
-        self._start_ns = state.t_ns
+        self._since_ns = state.t_ns
         self.ekf.resume(state, vo, camera)
 
     @property
@@ -100,9 +100,10 @@ class Filtering:
             vo = replace(vo, T_keyframe_body=None, tracking=Tracking.LOST)
             observations, at_rest, keyframe_id = no_observations(), False, None
         on_wheels = self._has_wheels and not at_rest
-        changed = None
-        if noise.scale != self._noise_applied:
-            self._noise_applied, changed = noise.scale, replace(noise, t_ns=max(noise.t_ns, self._start_ns))
+        is_new, self._noise_applied = noise.scale != self._noise_applied, noise.scale
+        changed = replace(noise, t_ns=max(noise.t_ns, self._since_ns)) if is_new else None
+        if self.coupling == "tight":  # going back through its tracks is a third of its time and brings nothing
+            self._since_ns = t_ns
         others = at_rest, on_wheels, keyframe_id, shows_scale, changed, imu_until_ns
         self._seen.append(Correction(t_ns, vo, observations, *others))
         newest_ns = t_ns - round(self._config.vision_delay_s * 1e9) + _STAMP_JITTER_NS
