@@ -91,7 +91,7 @@ static const uint8_t MOST_PASSED = 20;  // bytes of a receiver in a frame: with 
 struct Chip {
   uint8_t address;
   uint8_t id[3];
-  bool ready;
+  bool ready, failed;  // set up; not read the last time
   uint32_t tried_ms;
 };
 
@@ -344,19 +344,22 @@ static bool readMag() {
   return true;
 }
 
-// Read a chip, or try to set it up again now and then; at most one such attempt in a sample.
+// Read a chip. What failed once is read again in the next sample, for a setup costs an MPU a tenth of a second; what
+// failed twice is set up again, now and then, and at most one chip in a sample.
 static bool readOrRetry(Chip &chip, bool (*begin)(), bool (*read)(), bool &retried) {
   if (chip.ready) {
-    if (read()) return true;
-    chip.ready = false;
+    const bool isRead = read();
+    chip.ready = isRead || !chip.failed;
+    chip.failed = !isRead;
     chip.tried_ms = millis() - RETRY_MS;  // it may be well again in the next sample
-    return false;
+    return isRead;
   }
   if (!retried && millis() - chip.tried_ms >= RETRY_MS) {
     retried = true;
     chip.tried_ms = millis();
     if (!accelChip.ready && !gyroChip.ready) freeBus();
     chip.ready = begin();
+    chip.failed = false;
   }
   return false;
 }
