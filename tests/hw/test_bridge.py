@@ -159,9 +159,9 @@ def test_counts_of_an_mpu_wait_until_it_is_known_how_old_they_are() -> None:
     assert not behind.is_known
     other = bridged("MPU-6050")
     assert other.ages is not None
-    behind.take_ages(other.ages)  # of the chip before
+    behind.take(other.ages)  # of the chip before
     assert not behind.is_known
-    behind.take_ages(board.ages)
+    behind.take(board.ages)
     assert behind.is_known
     behind.greet(bridged("GY-85").hello)
     assert behind.is_known  # its filters are in the settings

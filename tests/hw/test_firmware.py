@@ -21,6 +21,7 @@ from vislam.hw.bridge.protocol import (
     Hello,
     Passed,
     RawSample,
+    Spent,
     Status,
     encode,
 )
@@ -88,10 +89,12 @@ def parts(messages: list) -> tuple[list[RawSample], list[Hello]]:
 def test_its_frames_are_ours_byte_for_byte(bridge: Path) -> None:
     messages, wire, registers = run(bridge, 3.0)
     assert b"".join(encode(message) for message in messages) == wire
+    spent = [m for m in messages if isinstance(m, Spent)]
+    assert [m.sequence for m in spent] == [0, 1, 2]
     samples, hellos = parts(messages)
     assert len(samples) == pytest.approx(2.88 * 400, abs=3)  # the chips take 0.12 s to start
     assert registers == "0b 1a 20"  # full resolution and 16 g; 2000 deg/s and 98 Hz; 1.3 gauss
-    assert [m.sequence for m in messages] == list(range(len(messages)))
+    assert [m.sequence for m in messages if m not in spent] == list(range(len(messages) - len(spent)))
     for n, sample in enumerate(samples):
         assert sample.accel == (n % 500, -(n % 500), 256)
         assert sample.gyro == (-(n % 700), 0, n % 700)
@@ -130,26 +133,11 @@ def test_it_compiles_for_an_esp32_with_any_of_its_ports(tmp_path: Path, usb: tup
     assert len(samples) > 100
 
 
-@pytest.mark.parametrize(("chip", "error"), [(str(0x53), Status.ACCEL_ERROR), (GYRO, Status.GYRO_ERROR)])
-def test_one_transfer_without_an_answer_costs_8_ms(bridge: Path, chip: str, error: Status) -> None:
-    samples, _ = parts(run(bridge, 2.0, silent=(chip, "200", "201"))[0])
-    failed = [n for n, sample in enumerate(samples) if error in sample.status]
-    assert len(failed) == 1
-    assert samples[failed[-1] + 1].t_us - samples[failed[0] - 1].t_us <= 8000
-
-
 def test_one_transfer_without_an_answer_costs_an_mpu_8_ms(bridge: Path) -> None:
     samples, _ = parts(run(bridge, 2.0, silent=(GYRO, "1000", "1001"), mpu="104 104 none 0")[0])
     failed = [n for n, sample in enumerate(samples) if Status.GYRO_ERROR in sample.status]
     assert len(failed) == 1
     assert samples[failed[0] + 1].t_us - samples[failed[0] - 1].t_us <= 8000
-
-
-def test_a_magnetometer_that_lost_its_settings_is_set_up_again(bridge: Path) -> None:
-    samples, _ = parts(run(bridge, 2.0, silent=(MAG, "0", "0"), forgets_at=40)[0])
-    failed = [n for n, sample in enumerate(samples) if Status.MAG_ERROR in sample.status]
-    assert 0 < len(failed) <= 100, "0.25 s"
-    assert any(Status.MAG_NEW in sample.status for sample in samples[failed[-1] :])
 
 
 def test_a_chip_that_goes_away_is_told_and_set_up_again(bridge: Path) -> None:
@@ -163,16 +151,6 @@ def test_a_chip_that_goes_away_is_told_and_set_up_again(bridge: Path) -> None:
     assert max((b.t_us - a.t_us) for a, b in pairwise(samples)) < 10_000  # the others are read on time
 
 
-@pytest.mark.parametrize(("address", "error"), [(0x53, Status.ACCEL_ERROR), (0x68, Status.GYRO_ERROR)])
-def test_a_chip_that_lost_its_settings_is_not_believed(bridge: Path, address: int, error: Status) -> None:
-    messages, _, registers = run(bridge, 2.0, silent=(str(address), "0", "0"), forgets_at=400)
-    samples, _ = parts(messages)
-    failed = [i for i, s in enumerate(samples) if error in s.status]
-    assert 1 <= len(failed) <= 60
-    assert failed[-1] - failed[0] + 1 == len(failed)
-    assert registers == "0b 1a 20"
-
-
 def test_without_a_magnetometer_the_rest_goes_on(bridge: Path) -> None:
     samples, hellos = parts(run(bridge, 2.0, silent=(MAG, "0", "1000000"))[0])
     assert hellos[0].chips == Chips.ACCEL | Chips.GYRO | Chips.STARTED
@@ -182,7 +160,7 @@ def test_without_a_magnetometer_the_rest_goes_on(bridge: Path) -> None:
 
 def test_a_line_that_takes_nothing_leaves_holes_and_stops_nothing(bridge: Path) -> None:
     messages = run(bridge, 2.0, blocked=("1000", "1100"))[0]
-    gaps = [(b.sequence - a.sequence) % 2**16 for a, b in pairwise(messages)]
+    gaps = [(b.sequence - a.sequence) % 2**16 for a, b in pairwise(m for m in messages if not isinstance(m, Spent))]
     assert max(gaps) == pytest.approx(41, abs=2)
     assert sorted(gaps)[-2] == 1
     samples, _ = parts(messages)

@@ -171,7 +171,7 @@ def test_a_sketch_with_encoders_and_nobody_who_asks_for_them(config: SerialConfi
 def test_a_front_process_that_takes_nothing_stops_nobody() -> None:
     passes, hears = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     clock = DeviceClock(BridgeClockConfig(settle_s=0.0))
-    passer = Passer(clock, 0, passes)
+    passer = Passer(clock, passes)
     hello = FrameDecoder().feed(b"\0" + encode(Hello(0, 0, Chips(15), 0, 0, b"   ", 400, 1, 1, 1, 1, 0, 1, 1, 1)))[0]
     assert isinstance(hello, Hello)
     passer.greet(hello)
@@ -191,7 +191,7 @@ def test_a_front_process_that_takes_nothing_stops_nobody() -> None:
 
 def test_what_a_full_socket_did_not_take_of_the_state_is_told_with_the_next_hello() -> None:
     passes, hears = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    passer = Passer(DeviceClock(BridgeClockConfig()), 0, passes)
+    passer = Passer(DeviceClock(BridgeClockConfig()), passes)
     for k in range(5000):  # more than it takes
         passer.lose(f"problem {k}")
     lost = passer.counts["passed_on_lost"]

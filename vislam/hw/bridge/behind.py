@@ -7,11 +7,11 @@ import numpy as np
 from vislam.config import SerialConfig
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.affine import Affine
-from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Ages, Chips, Hello, RawSample
+from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Ages, Chips, Hello, RawSample, Spent
 from vislam.hw.chips import mpu6050
 from vislam.hw.health import Health
 
-_CHIPS_S = 0.0005  # from a sample's time to its first byte: reading two chips at 400 kHz
+_CHIPS_S = 0.0005  # from a sample's time to its first byte, of a sketch that does not state it
 _MAG_DELAY_S = 0.0067  # half a period of 75 Hz
 _NS = 1_000_000_000
 _BITS_PER_BYTE = 10  # start, eight, stop
@@ -35,11 +35,8 @@ class Behind:
         self.hello: Hello | None = None
         self._ages: Ages | None = None
         self._config = config
-        wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
-        self.line_ns = round((wire_s + _CHIPS_S) * _NS)  # from a sample's time to its arrival on the clock's line
-        # kept for what it is: a sum that is rounded once
-        self._gy85_ns = round((wire_s + _CHIPS_S + config.filter_s) * _NS)
-        self._gy85_mag_ns = round((wire_s + _CHIPS_S + _MAG_DELAY_S) * _NS)
+        self._wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
+        self._spent_s = _CHIPS_S
         self._maps: tuple[Affine, Affine, Affine] | None = None  # gyro, accel, mag
         self._accel_before: tuple[int, Array] | None = None  # device time, counts
 
@@ -47,10 +44,19 @@ class Behind:
         """Another device may answer from now on."""
         self.hello = self._ages = None
         self._accel_before = None
+        self._spent_s = _CHIPS_S
 
-    def take_ages(self, ages: Ages) -> None:
-        """Take the ages that belong to the hello that follows."""
-        self._ages = ages
+    def take(self, stated: Ages | Spent) -> None:
+        """Take the ages that belong to the hello that follows, or how long a sample takes the device."""
+        if isinstance(stated, Spent):
+            self._spent_s = stated.spent_us * 1e-6
+        else:
+            self._ages = stated
+
+    @property
+    def line_ns(self) -> int:
+        """From a sample's time to the arrival of its last byte, at the least."""
+        return round((self._wire_s + self._spent_s) * _NS)
 
     def greet(self, hello: Hello) -> None:
         """Take what the device states about its chips."""
@@ -119,7 +125,7 @@ class Behind:
         assert self._maps is not None
         mag_map = self._maps[2]
         ages = self._stated
-        delay_ns = self._gy85_mag_ns if ages is None else self.line_ns + 1000 * ages.mag_us
+        delay_ns = round(_MAG_DELAY_S * _NS) if ages is None else 1000 * ages.mag_us
         field_ut = mag_map.matrix @ np.array(raw.mag, dtype=np.float64) + mag_map.offset
         return MagSample(stamp_ns - delay_ns, field_ut)
 
@@ -128,7 +134,7 @@ class Behind:
         assert self._maps is not None
         gyro_map, accel_map, _ = self._maps
         ages = self._stated
-        delay_ns = self._gy85_ns if ages is None else self.line_ns + 1000 * ages.gyro_us
+        delay_ns = round(self._config.filter_s * _NS) if ages is None else 1000 * ages.gyro_us
         rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
         rate -= drift_rad_s
         accel = np.array(raw.accel, dtype=np.float64)

@@ -29,6 +29,7 @@ from vislam.hw.bridge.protocol import (
     OtherVersion,
     Passed,
     RawSample,
+    Spent,
     Status,
 )
 from vislam.hw.gyro_zero import GyroZero
@@ -76,7 +77,7 @@ class SerialBridge:
         self._behind = Behind(config)
         self._decoder = FrameDecoder()
         self._clock = DeviceClock(config.clock)
-        self._passer = Passer(self._clock, self._behind.line_ns, further)
+        self._passer = Passer(self._clock, further)
         self._port: serial.Serial | None = None
         self._retry_ns = 0  # when to open the port
         self._patience_ns = 0  # until when a frame must have come
@@ -264,8 +265,8 @@ class SerialBridge:
         if isinstance(message, Hello):
             self._greet(message, arrival_ns)
             return []
-        if isinstance(message, Ages):
-            self._behind.take_ages(message)
+        if isinstance(message, Ages | Spent):
+            self._behind.take(message)
             return []
         self._follow(message, arrival_ns)
         hello = self._behind.hello
@@ -293,7 +294,7 @@ class SerialBridge:
             self._events |= Health.IMU_GAP
 
     def _sampled(self, raw: RawSample, hello: Hello, arrival_ns: int) -> list[ImuSample | MagSample]:
-        stamp_ns = self._clock.stamp(raw.t_us, arrival_ns)
+        stamp_ns = self._clock.stamp(raw.t_us, arrival_ns - self._behind.line_ns)
         self._note_status(raw, hello)
         if stamp_ns is None:
             self._counts["unstamped"] += 1

@@ -53,10 +53,10 @@ PassedOn = CountsAt | BytesAt | BridgeState
 class Passer:
     """Stamps counts and bytes by the host's clock and sends them on, through a socket that is never waited for."""
 
-    def __init__(self, clock: DeviceClock, delay_ns: int, to: socket.socket | None) -> None:
-        """Take the bridge's clock, from its time to an arrival on the clock's line, and where to; None: only count."""
+    def __init__(self, clock: DeviceClock, to: socket.socket | None) -> None:
+        """Take the bridge's clock and where to; None: only count."""
         self.counts: Counter[str] = Counter()
-        self._clock, self._delay_ns, self._to = clock, delay_ns, to
+        self._clock, self._to = clock, to
         self._sequences: dict[type, int] = {}
         self._reported: tuple[Chips, str, int] | None = None
         if to is not None:
@@ -70,16 +70,16 @@ class Passer:
         self.counts[f"{name}_frames"] += 1
         lost = 0 if last is None else (message.sequence - last - 1) % _SEQUENCES
         self.counts[f"{name}_lost"] += lost if lost < _SEQUENCES // 2 else 0  # else it began again, unannounced
-        line_ns = self._clock.host_ns(message.t_us)
-        if line_ns is None or self._reported is None:
+        t_ns = self._clock.host_ns(message.t_us)
+        if t_ns is None or self._reported is None:
             self.counts[f"{name}_unstamped"] += 1
             return
         if self._reported[2] != self._clock.steps:  # stamps before and after have no interval
             self._report(self._reported[0], self._reported[1])
         if isinstance(message, Counts):
-            self._send(_COUNTED, line_ns - self._delay_ns, _COUNTS.pack(message.left, message.right))
+            self._send(_COUNTED, t_ns, _COUNTS.pack(message.left, message.right))
         else:
-            self._send(_SAID, line_ns - self._delay_ns, message.data)
+            self._send(_SAID, t_ns, message.data)
 
     def greet(self, hello: Hello) -> None:
         """Report what the device has, where it is new or has just started."""

@@ -2,8 +2,8 @@
 
 A frame is `type, sequence, device time, body, CRC-16`, stuffed by COBS (Cheshire and Baker, 1999) and ended by a zero
 byte, all little-endian. Samples and hellos share one sequence; counts and passed bytes, which a sketch sends only where
-it has encoders or a receiver, and ages, which it sends only of chips other than a GY-85's, have one each: a host
-which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`).
+it has encoders or a receiver, ages, which it sends only of chips other than a GY-85's, and what a sample takes have one
+each: a host which does not know them misses nothing. The CRC is CCITT's with initial value 0xFFFF (`binascii.crc_hqx`).
 The structs, flags and values below are the whole table; firmware/vislam_bridge/vislam_bridge.ino is the other end.
 """
 
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 PROTOCOL_VERSION = 1
-SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE, AGES_TYPE = 1, 2, 3, 4, 5
+SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE, AGES_TYPE, SPENT_TYPE = 1, 2, 3, 4, 5, 6
 # longest stuffed frame, without its zero; a longer stretch without a zero is noise, and nothing of it is kept
 MAX_STUFFED_BYTES = 64
 
@@ -25,6 +25,7 @@ _COUNTS = struct.Struct("<BHIii")
 _PASSED = struct.Struct("<BHI")  # then the bytes
 MOST_PASSED = 20  # bytes in a frame: so that behind it an AVR's buffer still has room for a sample
 _AGES = struct.Struct("<BHIBHHH")
+_SPENT = struct.Struct("<BHIH")
 _VERSION_AT = 7  # the same in every version: type, sequence, microseconds, version
 _CRC = struct.Struct("<H")
 _CRC_BEGIN = 0xFFFF
@@ -57,7 +58,7 @@ class RawSample:
     """Counts of one sampling instant, in the axes of the chips."""
 
     sequence: int  # 16 bits, of all frames
-    t_us: int  # device time when the chips were read, 32 bits
+    t_us: int  # device time when the gyro was read, 32 bits
     status: Status
     accel: tuple[int, int, int]
     gyro: tuple[int, int, int]
@@ -128,16 +129,27 @@ class Ages:
     mag_us: int
 
 
-Message = RawSample | Hello | OtherVersion | Counts | Passed | Ages
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """How long a sample took at least, from its time to its first byte on the line; sent before a hello."""
+
+    sequence: int  # 16 bits, of these frames alone
+    t_us: int
+    spent_us: int
 
 
-def encode(message: RawSample | Hello | Counts | Passed | Ages) -> bytes:
+Message = RawSample | Hello | OtherVersion | Counts | Passed | Ages | Spent
+
+
+def encode(message: RawSample | Hello | Counts | Passed | Ages | Spent) -> bytes:
     """Return a frame with its zero at the end, byte for byte what the firmware sends."""
     if isinstance(message, RawSample):
         m = message
         body = _SAMPLE.pack(SAMPLE_TYPE, m.sequence, m.t_us, m.status, *m.accel, *m.gyro, *m.mag, m.temperature)
     elif isinstance(message, Counts):
         body = _COUNTS.pack(COUNTS_TYPE, message.sequence, message.t_us, message.left, message.right)
+    elif isinstance(message, Spent):
+        body = _SPENT.pack(SPENT_TYPE, message.sequence, message.t_us, message.spent_us)
     elif isinstance(message, Passed):
         body = _PASSED.pack(PASSED_TYPE, message.sequence, message.t_us) + message.data
     elif isinstance(message, Ages):
@@ -231,8 +243,19 @@ def _ages(body: bytes) -> Ages | None:
     return Ages(*_AGES.unpack(body)[1:]) if len(body) == _AGES.size else None
 
 
+def _spent(body: bytes) -> Spent | None:
+    return Spent(*_SPENT.unpack(body)[1:]) if len(body) == _SPENT.size else None
+
+
 _ALL_STATUS = sum(Status)
-_READERS = {SAMPLE_TYPE: _sample, HELLO_TYPE: _hello, COUNTS_TYPE: _counts, PASSED_TYPE: _passed, AGES_TYPE: _ages}
+_READERS = {
+    SAMPLE_TYPE: _sample,
+    HELLO_TYPE: _hello,
+    COUNTS_TYPE: _counts,
+    PASSED_TYPE: _passed,
+    AGES_TYPE: _ages,
+    SPENT_TYPE: _spent,
+}
 
 
 class FrameDecoder:

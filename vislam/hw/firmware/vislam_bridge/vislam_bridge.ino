@@ -15,7 +15,7 @@ static const uint32_t BAUD = 500000;
 static const uint16_t RATE_HZ = 400;      // of samples: 400, 200 or 100
 static const uint16_t MAG_RATE_HZ = 50;   // below the chip's 75, so that every reading is a new one
 static const uint32_t I2C_HZ = 400000;    // at 100000 reduce RATE_HZ to 100
-static const uint32_t RETRY_MS = 100;     // between attempts to set up a chip that does not answer
+static const uint32_t RETRY_MS = 40;      // between attempts to set up a chip that does not answer
 static const uint16_t I2C_TIMEOUT_MS = 3; // a stuck bus must not stop the clock
 
 // Ranges of an MPU-6050 and its kin, 0 to 3: 250, 500, 1000, 2000 degrees per second; 2, 4, 8, 16 g. The host is told.
@@ -40,7 +40,7 @@ static const uint16_t COUNTS_HZ = 50;
 static const uint32_t GNSS_BAUD = 9600;
 
 static const uint8_t PROTOCOL_VERSION = 1;
-static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2, COUNTS_TYPE = 3, PASSED_TYPE = 4, AGES_TYPE = 5;
+static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2, COUNTS_TYPE = 3, PASSED_TYPE = 4, AGES_TYPE = 5, SPENT_TYPE = 6;
 static const uint8_t STATUS_MAG_NEW = 1, STATUS_ACCEL_ERROR = 2, STATUS_GYRO_ERROR = 4, STATUS_MAG_ERROR = 8,
                      STATUS_MISSED = 16;
 static const uint8_t CHIPS_ACCEL = 1, CHIPS_GYRO = 2, CHIPS_MAG = 4, CHIPS_ENCODERS = 8, CHIPS_GNSS = 16,
@@ -114,8 +114,10 @@ static bool helloPending = true, started = true, missed = false;
 static bool isMpu = false, boardKnown = false;  // which board it is stays until the sketch starts anew
 static uint8_t strangerId;                      // that a chip says in a MPU's place, none that is known
 static uint8_t hellosOwed;                      // before another sample is sent
-static bool agesTold;                           // for the hello that follows
-static uint16_t agesSent;
+static uint8_t toldFirst;                       // before the hello that follows: what is spent, ages
+static uint16_t agesSent, spentSent;
+static uint32_t readUs, gyroUs, handedUs;  // when data were asked for last, those of the gyro; a frame given to the line
+static uint16_t spentUs = 0xFFFF;          // the least from a sample's time to that, since it was told
 static uint32_t mpuBegunMs;
 static bool magIsAk = false, magFresh = false, magSeen = false;
 static bool magUntold = true;  // no hello has said yet which magnetometer it is
@@ -162,6 +164,7 @@ static bool readRegisters(uint8_t address, uint8_t number, uint8_t *into, uint8_
   Wire.beginTransmission(address);
   Wire.write(number);
   if (Wire.endTransmission(false) != 0) return false;
+  readUs = micros();
   if (Wire.requestFrom(address, count) != count) return false;
   for (uint8_t i = 0; i < count; i++) into[i] = (uint8_t)Wire.read();
   return true;
@@ -212,6 +215,7 @@ static bool beginGyro() {
 static bool readGyro() {
   uint8_t data[14];
   if (!readRegisters(gyroChip.address, 0x15, data, 14) || data[1] != GYRO_FILTER) return false;
+  gyroUs = readUs;
   temperature = bigEndian(data + 6);
   for (uint8_t i = 0; i < 3; i++) gyro[i] = bigEndian(data + 8 + 2 * i);
   return true;
@@ -258,8 +262,9 @@ static bool beginMpu() {
 
 static bool readMpu() {
   uint8_t data[14], settings[5];
-  if (!readRegisters(gyroChip.address, 0x3B, data, 14) || !readRegisters(gyroChip.address, 0x19, settings, 5) ||
-      settings[0] != 0x00 || settings[1] != MPU_FILTER || settings[2] != MPU_GYRO_RANGE << 3 ||
+  if (!readRegisters(gyroChip.address, 0x3B, data, 14)) return false;
+  gyroUs = readUs;
+  if (!readRegisters(gyroChip.address, 0x19, settings, 5) || settings[0] != 0x00 || settings[1] != MPU_FILTER || settings[2] != MPU_GYRO_RANGE << 3 ||
       settings[3] != MPU_ACCEL_RANGE << 3 || (gyroChip.id[0] != 0x68 && settings[4] != MPU_FILTER))
     return false;
   temperature = bigEndian(data + 6);
@@ -414,6 +419,7 @@ static bool sendFrame() {
   wire[codeAt] = length - codeAt;
   wire[length++] = 0;
   if (Serial.availableForWrite() < length) return false;
+  handedUs = micros();
   Serial.write(wire, length);
   return true;
 }
@@ -425,6 +431,13 @@ static void sendSample(uint32_t timeUs, uint8_t status) {
   for (uint8_t i = 0; i < 3; i++) put16((uint16_t)gyro[i]);
   for (uint8_t i = 0; i < 3; i++) put16((uint16_t)mag[i]);
   put16((uint16_t)temperature);
+  if (sendFrame() && handedUs - timeUs < spentUs) spentUs = (uint16_t)(handedUs - timeUs);
+}
+
+static void sendSpent(uint32_t timeUs) {
+  beginFrame(SPENT_TYPE, spentSent++, timeUs);
+  put16(spentUs);
+  spentUs = 0xFFFF;
   sendFrame();
 }
 
@@ -462,15 +475,21 @@ static bool sendHello(uint32_t timeUs) {
   return true;
 }
 
-// Say hello where the line takes it, before it how old the values of a MPU are. Returns whether it was said.
+// Say hello where the line takes it, before it how long samples took, and how old the values of a MPU are. Returns
+// whether it was said.
 static bool greet(uint32_t timeUs) {
   if (Serial.availableForWrite() < MAX_BODY + 4) return false;
-  if (isMpu && !agesTold) {
-    agesTold = true;
+  if (toldFirst == 0 && spentUs != 0xFFFF) {
+    toldFirst = 1;
+    sendSpent(timeUs);
+    return false;
+  }
+  if (toldFirst <= 1 && isMpu) {
+    toldFirst = 2;
     sendAges(timeUs);
     return false;
   }
-  agesTold = false;
+  toldFirst = 0;
   return sendHello(timeUs);
 }
 
@@ -550,7 +569,10 @@ static void sampleAndSend(uint32_t timeUs) {
   uint8_t status = missed ? STATUS_MISSED : 0;
   missed = false;
   bool retried = false;
-  if (!readOrRetry(gyroChip, beginGyroOrMpu, readGyroOrMpu, retried)) status |= STATUS_GYRO_ERROR;
+  if (readOrRetry(gyroChip, beginGyroOrMpu, readGyroOrMpu, retried))
+    timeUs = gyroUs;
+  else
+    status |= STATUS_GYRO_ERROR;
   if (isMpu) {
     accelChip.ready = gyroChip.ready;
     if (millis() - mpuBegunMs < MPU_START_MS) status |= STATUS_GYRO_ERROR;  // it was set up anew, and is starting
