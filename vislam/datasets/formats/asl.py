@@ -12,6 +12,7 @@ import numpy as np
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
+from vislam.core.findings import Finding
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
@@ -21,6 +22,7 @@ from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.formats.truth import Truth, asl_truth
 from vislam.datasets.images import DepthFormat, ImageList
 from vislam.datasets.imu_files import imu_calibration, mag_calibration, read_noise
+from vislam.datasets.imu_tables import Pair, pair_in
 from vislam.datasets.stream import Survey, image_list, with_depth_format
 from vislam.datasets.tables import read_names
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -44,6 +46,9 @@ def survey(path: Path) -> Survey:
     problems = Problems()
     errors: list[DataError] = []
     imu_file, imu_noise, T_body_imu, imu_calibration = _imu(root, errors)
+    pair = _pair(root, errors) if imu_file is None else None
+    if pair is not None:
+        _, imu_noise, T_body_imu, imu_calibration = _imu(root, errors, pair[0].rates.path)
     cameras, rig = _cameras(root, T_body_imu, problems, errors)
     depth, how = _depth(root, rig, problems, errors)
     if rig is not None and depth is not None:
@@ -56,6 +61,8 @@ def survey(path: Path) -> Survey:
         depth=depth,
         rig=rig,
         imu_file=imu_file,
+        samples=None if pair is None else pair[0],
+        findings=() if pair is None else (pair[1],),
         imu_noise=imu_noise,
         imu_calibration=imu_calibration,
         mag_file=mag_file,
@@ -75,9 +82,20 @@ def _root(path: Path) -> Path | None:
     return None
 
 
-def _imu(root: Path, errors: list[DataError]) -> tuple[Path | None, ImuNoise | None, Array, ImuCalibration | None]:
+def _pair(root: Path, errors: list[DataError]) -> tuple[Pair, Finding] | None:
+    """Return the tables of rates and forces where they are apart: in `imu0`, or as `gyro0` and `accel0` beside it."""
+    try:
+        return pair_in(root / "imu0") or pair_in(root)
+    except DataError as error:
+        errors.append(error)
+        return None
+
+
+def _imu(
+    root: Path, errors: list[DataError], pair: Path | None = None
+) -> tuple[Path | None, ImuNoise | None, Array, ImuCalibration | None]:
     """Return the IMU's file, its noise, its pose in the file's body frame, and its calibration if samples are raw."""
-    data, sensor = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
+    data, sensor = pair or root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
     if not data.is_file():
         return None, None, np.eye(4), None
     try:

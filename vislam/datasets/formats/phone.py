@@ -1,10 +1,11 @@
 """What apps on phones write: rates, forces and frames as tables beside a film.
 
-Three descriptions are read, each recognised by the names of its files and columns:
+Four descriptions are read, each recognised by the names of its files and columns:
 
 - Sensor Logger (tszheichoi.com): `Gyroscope.csv`, `TotalAcceleration.csv` or `Accelerometer.csv` with `Gravity.csv`;
 - the Mobile AR Sensor (MARS) logger: `gyro_accel.csv`, `frame_timestamps.txt` or `movie_metadata.csv`, `movie.mp4`;
-- ADVIO (Cortés et al., ECCV 2018): `gyro.csv`, `accelerometer.csv`, `frames.csv`, `frames.mov`.
+- ADVIO (Cortés et al., ECCV 2018): `gyro.csv`, `accelerometer.csv`, `frames.csv`, `frames.mov`;
+- any other pair of tables of rates and forces, with a film or without.
 
 The camera's calibration is `camera.yaml` in the folder, the IMU's noise `imu.yaml`.
 """
@@ -14,7 +15,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -28,30 +28,31 @@ from vislam.core.reading import open_file, read_text
 from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList, check_size_px
-from vislam.datasets.imu_pairs import ImuRows, Rows, paired
+from vislam.datasets.imu_pairs import ImuRows
+from vislam.datasets.imu_tables import (
+    STANDARD_GRAVITY_M_S2,
+    Pair,
+    Table,
+    Whole,
+    header,
+    holds_pair,
+    is_number,
+    pair_in,
+)
 from vislam.datasets.loaders import video_facts
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import (
-    MAX_LINE_BYTES,
-    Row,
-    in_time_order,
-    parse_ns,
-    parse_seconds,
-    read_frame_stamps,
-    read_rows,
-)
+from vislam.datasets.tables import MAX_LINE_BYTES, Row, parse_ns, parse_seconds, read_frame_stamps
 
 LOOKS_FOR = (
-    "Gyroscope.csv of Sensor Logger, gyro_accel.csv of the MARS logger, or gyro.csv, accelerometer.csv and frames.mov"
+    "Gyroscope.csv of Sensor Logger, gyro_accel.csv of the MARS logger, gyro.csv, accelerometer.csv and frames.mov, or "
+    "gyro.csv and accel.csv"
 )
-_STANDARD_GRAVITY_M_S2 = 9.80665
-_HEADER_LINES = 5
 _MOST_METADATA_BYTES = 2**16
 _LOOKED_AT = 500  # forces, to distinguish g from m/s^2
 _AXES = ("x", "y", "z")
 _RATES = ("gx[rad/s]", "gy[rad/s]", "gz[rad/s]")
 _FORCES = ("ax[m/s^2]", "ay[m/s^2]", "az[m/s^2]")
-Logger = Literal["Sensor Logger", "MARS logger", "ADVIO"]
+Logger = Literal["Sensor Logger", "MARS logger", "ADVIO", "two tables"]
 
 
 def recognises(path: Path) -> bool:
@@ -72,6 +73,9 @@ def survey(path: Path) -> Survey:
         imu_noise, T_body_imu = read_imu(_asked(path / "imu.yaml", "write the noise of the IMU into it"))
     except DataError as error:
         errors.append(error)
+    if logger == "two tables" and not _films(path):
+        return Survey("phone", path, samples=samples, imu_noise=imu_noise, findings=tuple(findings),
+                      problems=problems, errors=tuple(errors))  # fmt: skip
     try:
         file = read_camera(_asked(path / "camera.yaml", f"write the calibration into it: {CAMERA_EXAMPLE}"))
         rig = Rig((file.camera,), (invert(T_body_imu) @ file.T_body_cam,))
@@ -94,97 +98,22 @@ def survey(path: Path) -> Survey:
     )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class _Table:
-    """Columns of a table: stamps and three numbers."""
-
-    path: Path
-    columns: tuple[int, ...]
-    stamp_column: int = 0
-    parse_stamp: Callable[[str], int] = parse_ns
-    factor: float = 1.0
-
-    def rows(self, problems: Problems) -> Rows:
-        def parse(fields: list[str]) -> Row[list[float]]:
-            if len(fields) <= max(self.stamp_column, *self.columns):
-                raise ValueError
-            numbers = [self.factor * float(fields[k]) for k in self.columns]
-            if not all(map(math.isfinite, numbers)):
-                raise ArithmeticError
-            return self.parse_stamp(fields[self.stamp_column].strip()), numbers
-
-        found = read_rows(self.path, parse, problems, ",", needs_line_end=True)
-        return in_time_order(found, problems, self.path.name)
-
-
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """Rates and forces that were sampled apart; `gravity` is to be added to forces that are without it."""
-
-    rates: _Table
-    forces: _Table
-    gravity: _Table | None = None
-
-    def imu_rows(self, problems: Problems) -> Rows:
-        """Yield stamp, rates and forces, forces interpolated at the stamps of the rates."""
-        forces = self.forces.rows(problems)
-        if self.gravity is not None:
-            both = paired(forces, self.gravity.rows(problems), problems, f"{self.forces.path.name} with gravity")
-            forces = ((t_ns, [a + g for a, g in zip(row[:3], row[3:], strict=True)]) for t_ns, row in both)
-        return paired(self.rates.rows(problems), forces, problems, self.rates.path.parent.name)
-
-
-@dataclass(frozen=True, slots=True)
-class _Whole:
-    """Rates and forces in one table."""
-
-    table: _Table
-
-    def imu_rows(self, problems: Problems) -> Rows:
-        """Yield stamp, rates and forces."""
-        return self.table.rows(problems)
-
-
 def _logger(path: Path) -> Logger | None:
     """Return which logger wrote a folder."""
-    if {"time", "seconds_elapsed", *_AXES} <= {*_header(path / "Gyroscope.csv")}:
+    if {"time", "seconds_elapsed", *_AXES} <= {*header(path / "Gyroscope.csv")}:
         return "Sensor Logger"
-    if {*_RATES, *_FORCES} <= {*_header(path / "gyro_accel.csv")}:
+    if {*_RATES, *_FORCES} <= {*header(path / "gyro_accel.csv")}:
         return "MARS logger"
     if all((path / name).is_file() for name in ("frames.mov", "frames.csv", "accelerometer.csv")) and _advio_rates(
         path
     ):
         return "ADVIO"
-    return None
+    return "two tables" if holds_pair(path) else None
 
 
 def _advio_rates(path: Path) -> Path | None:
     """Return the table of rates: `gyro.csv` in the archives, `gyroscope.csv` in their description."""
     return next((path / name for name in ("gyro.csv", "gyroscope.csv") if (path / name).is_file()), None)
-
-
-def _header(path: Path) -> tuple[str, ...]:
-    """Return the names of a table's columns; empty where there is no such table, or none in its first lines."""
-    if not path.is_file():
-        return ()
-    try:
-        with open_file(path) as file:
-            for _ in range(_HEADER_LINES):
-                line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").strip(" #\r\n")
-                names = tuple(name.strip(' "') for name in line.split(","))
-                if len(names) >= 4 and not any(map(_is_number, names)):
-                    return names
-    except OSError:
-        return ()
-    return ()
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _asked(path: Path, what: str) -> Path:
@@ -199,11 +128,13 @@ def _samples(path: Path, logger: Logger | None) -> tuple[ImuRows, list[Finding]]
         return _of_sensor_logger(path)
     if logger == "MARS logger":
         table = path / "gyro_accel.csv"
-        names = _header(table)
+        names = header(table)
         columns = tuple(names.index(name) for name in (*_RATES, *_FORCES))
         parse = _stamp_parser(names[0], table)
-        found = Finding("ok", "MARS logger: forces were interpolated at the stamps of the rates by the app", path.name)
-        return _Whole(_Table(table, columns, 0, parse)), [found]
+        what = "MARS logger: forces were interpolated at the stamps of the rates by the app"
+        return Whole(Table(table, columns, 0, parse)), [Finding("ok", what, path.name)]
+    if logger == "two tables" and (found := pair_in(path)) is not None:
+        return found[0], [found[1]]
     return _of_advio(path)
 
 
@@ -216,7 +147,7 @@ def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
     if (path / "TotalAcceleration.csv").is_file():
         forces = _of_axes(path / "TotalAcceleration.csv", factor)
         what = f"{app}: TotalAcceleration.csv is interpolated at the stamps of Gyroscope.csv"
-        return _Pair(rates, forces), [Finding("ok", what, path.name)]
+        return Pair(rates, forces), [Finding("ok", what, path.name)]
     if not (path / "Accelerometer.csv").is_file():
         raise DataError(
             f"{path} holds neither TotalAcceleration.csv nor Accelerometer.csv; record the accelerometer, too"
@@ -234,14 +165,14 @@ def _of_sensor_logger(path: Path) -> tuple[ImuRows, list[Finding]]:
     forces, gravity = (_of_axes(path / name, factor) for name in ("Accelerometer.csv", "Gravity.csv"))
     sign = ", negated as it is Apple's" if factor < 0.0 else ""
     what = f"{app}: Accelerometer.csv and Gravity.csv are added{sign} and interpolated at the stamps of Gyroscope.csv"
-    return _Pair(rates, forces, gravity), [Finding("ok", what, path.name)]
+    return Pair(rates, forces, gravity), [Finding("ok", what, path.name)]
 
 
-def _of_axes(path: Path, factor: float) -> _Table:
-    names = _header(path)
+def _of_axes(path: Path, factor: float) -> Table:
+    names = header(path)
     if not {"time", *_AXES} <= {*names}:
         raise DataError(f"{path} lacks the columns time, x, y, z; it has {', '.join(names) or 'no header'}")
-    return _Table(path, tuple(names.index(axis) for axis in _AXES), names.index("time"), parse_ns, factor)
+    return Table(path, tuple(names.index(axis) for axis in _AXES), names.index("time"), parse_ns, factor)
 
 
 def _platform(path: Path) -> tuple[str, bool]:
@@ -260,18 +191,18 @@ def _platform(path: Path) -> tuple[str, bool]:
 def _of_advio(path: Path) -> tuple[ImuRows, list[Finding]]:
     rates = _advio_rates(path)
     assert rates is not None
-    forces = _Table(path / "accelerometer.csv", (1, 2, 3), 0, parse_seconds)
+    forces = Table(path / "accelerometer.csv", (1, 2, 3), 0, parse_seconds)
     rows = forces.rows(Problems())
     norms = [math.hypot(*row[1]) for row, _ in zip(rows, range(_LOOKED_AT), strict=False)]
     usual = float(np.median(norms)) if norms else math.nan
-    in_g = usual < 0.5 * _STANDARD_GRAVITY_M_S2
+    in_g = usual < 0.5 * STANDARD_GRAVITY_M_S2
     unit = "g, as its description states" if in_g else "m/s^2, though its description states g"
     what = (
         f"ADVIO: accelerometer.csv of usually {usual:.2f} is taken as {unit}; interpolated at the stamps of the rates"
     )
-    factor = _STANDARD_GRAVITY_M_S2 if in_g else 1.0
-    forces = _Table(forces.path, forces.columns, 0, parse_seconds, factor)
-    return _Pair(_Table(rates, (1, 2, 3), 0, parse_seconds), forces), [Finding("ok", what, path.name)]
+    factor = STANDARD_GRAVITY_M_S2 if in_g else 1.0
+    forces = Table(forces.path, forces.columns, 0, parse_seconds, factor)
+    return Pair(Table(rates, (1, 2, 3), 0, parse_seconds), forces), [Finding("ok", what, path.name)]
 
 
 def _stamp_parser(name: str, path: Path) -> Callable[[str], int]:
@@ -289,6 +220,11 @@ def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[Imag
         return _sensor_logger_frames(path, problems)
     parse: Callable[[str], int] = parse_seconds
     video, stamps = path / "frames.mov", path / "frames.csv"
+    if logger == "two tables":
+        video, parse = _films(path)[0], parse_ns
+        stamps = video.with_suffix(".csv")
+        if len(_films(path)) > 1:
+            raise DataError(f"{path} holds {len(_films(path))} films; keep one, or name one as video:FILE")
     if logger == "MARS logger":
         video = next(
             (v for v in sorted(path.glob("movie.*")) if v.suffix.lower() in (".mp4", ".mov")), path / "movie.mp4"
@@ -298,7 +234,16 @@ def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[Imag
         first = _first_name(_asked(stamps, "copy it from the phone"))
         parse = _stamp_parser(first, stamps) if first else parse_ns
     _asked(video, "copy it from the phone")
-    return image_list("cam0", path, read_frame_stamps(_asked(stamps, "copy it"), problems, parse), problems), video
+    return image_list(
+        "cam0",
+        path,
+        read_frame_stamps(_asked(stamps, "write the time of each frame into it"), problems, parse),
+        problems,
+    ), video
+
+
+def _films(path: Path) -> list[Path]:
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in (".mp4", ".mov"))
 
 
 def _first_name(path: Path) -> str:
@@ -308,7 +253,7 @@ def _first_name(path: Path) -> str:
             first = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").split(",")[0].strip(" #\r\n")
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    return "" if _is_number(first) else first
+    return "" if is_number(first) else first
 
 
 def _sensor_logger_frames(path: Path, problems: Problems) -> tuple[ImageList, Path | None]:

@@ -1,7 +1,8 @@
 """A plain video file with the stamps of its frames beside it, and optionally an IMU.
 
 For `ride.mp4`: `ride.csv` (one row a frame, stamp in ns), `ride.yaml` (a camera's sensor file), and, if there is an
-IMU, `ride.imu.csv` and `ride.imu.yaml` in the ASL layout. Every stamp must be from the clock that stamps the IMU.
+IMU, `ride.imu.csv` (or `ride.gyro.csv` and `ride.accel.csv`) and `ride.imu.yaml` in the ASL layout. Every stamp must be
+from the clock that stamps the IMU.
 
 An MP4 without `ride.csv` has its frames stamped by its own table of times. Of a GoPro's, the IMU in its telemetry is
 by that clock, too, and is read where `ride.imu.yaml` states its noise; later chapters are one film with the first.
@@ -25,6 +26,8 @@ from vislam.core.geometry import invert
 from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList, check_size_px
+from vislam.datasets.imu_pairs import ImuRows
+from vislam.datasets.imu_tables import Pair, pair_in
 from vislam.datasets.loaders import video_facts
 from vislam.datasets.stream import Survey, image_list
 from vislam.datasets.tables import Row, read_frame_stamps
@@ -78,8 +81,11 @@ def _survey(path: Path, joined: bool) -> Survey:
     findings = [] if telemetry is None else telemetry.findings()
     if (why := _why_unused(path)) and telemetry is not None and telemetry.has_imu:
         findings.append(Finding("warning", f"the IMU of the telemetry is not used: {why}", path.name, ""))
-    samples = telemetry if telemetry is not None and telemetry.has_imu and not why else None
+    samples: ImuRows | None = telemetry if telemetry is not None and telemetry.has_imu and not why else None
     try:
+        if not path.with_suffix(".imu.csv").is_file() and (pair := pair_in(path.parent, path.stem)) is not None:
+            samples, stated = pair
+            findings.append(stated)
         if path.with_suffix(".imu.csv").is_file():
             imu_file = path.with_suffix(".imu.csv")
         if imu_file is not None or samples is not None:
@@ -92,7 +98,8 @@ def _survey(path: Path, joined: bool) -> Survey:
         errors.append(error)
     try:
         film = joined_film(path) if joined and is_mp4(path) and later_chapters(path) != ([], "") else None
-        cameras = (_frames(path, problems) if film is None else _of_film(film, path, problems),)
+        own_clock = path.with_suffix(".imu.csv").is_file() or isinstance(samples, Pair)
+        cameras = (_frames(path, problems, own_clock) if film is None else _of_film(film, path, problems),)
         size, frames = video_facts(path)
         if frames > 0 and (film is None or len(film.chapters) == 1):  # some containers do not know
             last = int(cameras[0].files[-1]) + 1 if cameras[0].files else 0
@@ -124,11 +131,11 @@ def _imu(path: Path) -> tuple[ImuNoise, NDArray[np.float64]]:
     return read_imu(sensor)
 
 
-def _frames(path: Path, problems: Problems) -> ImageList:
+def _frames(path: Path, problems: Problems, own_clock: bool) -> ImageList:
     stamps = path.with_suffix(".csv")
     if stamps.is_file():
         return image_list("cam0", path.parent, read_frame_stamps(stamps, problems), problems)
-    if is_mp4(path) and not path.with_suffix(".imu.csv").is_file():  # that IMU would have another clock
+    if is_mp4(path) and not own_clock:  # else the IMU would have another
         return image_list("cam0", path.parent, _own_times(path), problems)
     raise DataError(f"{stamps} is missing; write one row a frame into it: the time of its exposure in ns")
 
