@@ -19,7 +19,7 @@ from vislam.config import CalibrationConfig, Config, load
 from vislam.core.camera import Camera, CameraSigmas, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import se3_exp
-from vislam.core.messages import ImuSample, MagSample
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.datasets import open_dataset
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.calibration import camera_text, imu_text
@@ -34,6 +34,7 @@ from vislam.datasets.imu_files import (
 )
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.runs.sources import open_source
+from worlds import mini_recording as mini
 from worlds.calibration import T0_NS, write_table
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 50.0)
@@ -49,7 +50,7 @@ lenses = st.one_of(
 )
 cameras = st.builds(
     lambda size, f, c, skew, lens: Camera(*size, *f, *c, skew, *lens),
-    st.tuples(st.integers(1, 8000), st.integers(1, 8000)),
+    st.tuples(st.integers(1, 5792), st.integers(1, 5792)),
     st.tuples(st.floats(1e-2, 1e5), st.floats(1e-2, 1e5)),
     st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
     st.sampled_from([0.0, 0.25, -3e-5]),
@@ -314,3 +315,51 @@ def test_a_run_takes_the_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "0.012" in text and str(files.imu) in text and config.init.time_offset_s == 0.0
     assert run_verb([*command, "--overwrite", "--calibration.imu", str(tmp_path / "none.yaml")]) == 3
     assert "none.yaml" in capsys.readouterr().err
+
+
+def stereo_chain(offsets_s: tuple[float | None, float | None]) -> str:
+    camera = Camera(mini.WIDTH, mini.HEIGHT, 50.0, 51.0, 31.5, 23.5)
+    poses = [se3_exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0])) for x_m in (0.0, 0.1)]
+    return camchain_text([CameraCalibration(camera, T, t) for T, t in zip(poses, offsets_s, strict=True)], "stereo")
+
+
+def frame_stamps(root: Path, files: CalibrationConfig | None = None) -> list[int]:
+    return [event.t_ns - mini.BEGIN_NS for event in open_dataset(str(root), files).events() if isinstance(event, Frame)]
+
+
+@pytest.fixture
+def stereo(tmp_path: Path) -> Path:
+    """The images of cam1 bear stamps that are 4 ms late."""
+    root = tmp_path / "r" / "mav0"
+    for index in range(2):
+        mini.write_camera(root, f"cam{index}", 4, 0.1 * index, seed=9 * index)
+    rows = root / "cam1" / "data.csv"
+    rows.write_text(re.sub(r"(?m)^(\d+)", lambda row: str(int(row[1]) + 4_000_000), rows.read_text()))
+    return root
+
+
+def test_the_second_cameras_own_clock_is_used_and_stated(stereo: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(DataError, match="share no image within"):
+        frame_stamps(stereo)
+    path = written(stereo_chain((0.010, 0.006)))
+    assert frame_stamps(stereo, CalibrationConfig(camera=str(path))) == [k * mini.FRAME_NS for k in range(4)]
+    assert caplog.messages == [f"stamps are moved by timeshift_cam_imu of {path}: cam1 -4.000 ms"]
+    with pytest.raises(DataError, match="timeshift_cam_imu stands for cam1 alone; write cam0's, too"):
+        frame_stamps(stereo, CalibrationConfig(camera=str(written(stereo_chain((None, 0.006))))))
+    with pytest.raises(DataError, match=r"timeshift_cam_imu of 1e\+300 s; it is what two clocks differ by"):
+        frame_stamps(stereo, CalibrationConfig(camera=str(written(stereo_chain((1e300, 1e300))))))
+
+
+def test_the_clocks_of_a_recordings_own_chain_are_used_and_stated(
+    stereo: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (stereo / "camchain.yaml").write_text(stereo_chain((0.010, 0.006)))
+    for index in range(2):
+        (stereo / f"cam{index}" / "sensor.yaml").unlink()
+    assert frame_stamps(stereo) == [10_000_000 + k * mini.FRAME_NS for k in range(4)]
+    moves = "cam0 +10.000 ms, cam1 +6.000 ms"
+    assert caplog.messages == [f"stamps are moved by timeshift_cam_imu of {stereo}: {moves}"]
+    named = written(stereo_chain((0.002, -0.002)))  # goes before it; the first camera's goes to the settings
+    assert frame_stamps(stereo, CalibrationConfig(camera=str(named))) == [k * mini.FRAME_NS for k in range(4)]
+    lacking = written(stereo_chain((None, None)))  # what a file lacks stays as the recording has it
+    assert frame_stamps(stereo, CalibrationConfig(camera=str(lacking)))[0] == 10_000_000

@@ -50,7 +50,7 @@ def open_dataset(uri: str, calibration: CalibrationConfig | None = None) -> Reco
         DataError: the path holds no recording of the format, or one that cannot be replayed.
     """
     found = survey(uri)
-    return FileRecording(with_imu_rate(found if calibration is None else calibrated(found, calibration)))
+    return FileRecording(with_imu_rate(calibrated(found, calibration or CalibrationConfig())))
 
 
 def survey(uri: str) -> Survey:

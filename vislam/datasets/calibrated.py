@@ -14,7 +14,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
-from vislam.datasets.calibration import DepthFile, parse_depth
+from vislam.datasets.calibration import DepthFile, parse_depth, warn_once
 from vislam.datasets.camera_files import CameraCalibration, read_cameras
 from vislam.datasets.foreign_cameras import load_keys
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
@@ -30,6 +30,8 @@ def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
 
     Raises DataError when a file cannot be used, or has another number of cameras or another image size.
     """
+    given = () if files.camera is None else _against_first(Path(files.camera))
+    found = _moved(found, given or found.clocks, str(files.camera if given else found.root))
     if files.camera is not None and found.rig is not None:
         found = replace(found, rig=_rig(found.rig, Path(files.camera)))
     elif files.camera is not None and found.known_cameras:
@@ -84,6 +86,34 @@ def with_clock(config: Config) -> Config:
         sigma_s = max(_OFFSET_WIDER * first.time_offset_sigma_s, _LEAST_OFFSET_SIGMA_S)
         init = replace(init, time_offset_sigma_s=min(sigma_s, init.time_offset_sigma_s))
     return replace(config, init=init)
+
+
+def _against_first(path: Path) -> list[float | None]:
+    """Return what is to be added to stamps of cameras in s, beyond the first's (`with_clock`); empty if not stated."""
+    first, *others = (camera.time_offset_s for camera in read_cameras(path))
+    if first is None:
+        if any(other is not None for other in others):
+            raise DataError(f"{path}: timeshift_cam_imu stands for cam1 alone; write cam0's, too")
+        return []
+    return [0.0, *(None if other is None else other - first for other in others)]
+
+
+def _moved(found: Survey, clocks: Sequence[float | None], of: str) -> Survey:
+    """Return what a recording holds, with the stamps of its cameras moved, which is stated."""
+    later_ns = [round((clock or 0.0) * 1e9) for clock in clocks][: len(found.cameras)]
+    if not any(later_ns):
+        return found
+    pairs = zip(found.cameras, [*later_ns, *[0] * len(found.cameras)], strict=False)
+    cameras = tuple(replace(camera, t_ns=camera.t_ns + ns) for camera, ns in pairs)
+    moves = ", ".join(f"{camera.name} {ns * 1e-6:+.3f} ms" for camera, ns in zip(cameras, later_ns, strict=False) if ns)
+    warn_once(f"stamps are moved by timeshift_cam_imu of {of}: {moves}")
+    depth = found.depth  # its stamps are of the first camera's clock
+    return replace(
+        found,
+        cameras=cameras,
+        depth=None if depth is None else replace(depth, t_ns=depth.t_ns + later_ns[0]),
+        clocks=(),
+    )
 
 
 def _with_depth(found: Survey, path: Path) -> Survey:

@@ -97,7 +97,7 @@ class Keys(dict[str, Any]):
                 f"wrong place or time; write {instead}, or remove it"
             )
         if unused := [key for key, value in rest.items() if not _says_nothing(value)]:
-            _warn_once(f"{path}: not used: {_listed(unused)}")
+            warn_once(f"{path}: not used: {_listed(unused)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +123,7 @@ class CameraFile:
     T_body_cam: Array  # [4, 4]
     rate_hz: float | None = None
     depth: DepthFile = field(default_factory=DepthFile)  # where depth images share the camera's file
+    clock_s: float | None = None  # to be added to its stamps to get the IMU's time
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
@@ -342,5 +343,6 @@ def _listed(keys: list[str]) -> str:
 
 
 @lru_cache(maxsize=256)  # a file is read several times on the way to a run
-def _warn_once(text: str) -> None:
+def warn_once(text: str) -> None:
+    """Warn of something about a file, which is opened several times."""
     _LOG.warning("%s", text)

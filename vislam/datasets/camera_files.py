@@ -29,6 +29,7 @@ _ROS_MODELS: dict[Distortion, str] = {
     "radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob", "rational": _RATIONAL,
 }  # fmt: skip
 _RIGID = 1e-3
+_FARTHEST_S = 1e9  # clocks that begin in 1970 and at boot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +142,8 @@ def _chain_entry(index: int, found: CameraCalibration) -> str:
 def _offset(entry: Mapping[str, Any], path: Path) -> tuple[float | None, float | None]:
     keys = ("timeshift_cam_imu", "timeshift_cam_imu_sigma")
     values = [None if entry.get(key) is None else numbers_in({key: [entry[key]]}, key, path, 1)[0] for key in keys]
+    if values[0] is not None and abs(values[0]) > _FARTHEST_S:
+        raise DataError(f"{path}: timeshift_cam_imu of {values[0]:g} s; it is what two clocks differ by, in seconds")
     return values[0], values[1]
 
 

@@ -104,6 +104,7 @@ class Survey:
     video: Path | None = None  # the frames come from here; the files of cam0 are frame numbers
     later_videos: tuple[tuple[Path, int], ...] = ()  # what follows it, and the numbers of their first frames
     rig: Rig | None = None
+    clocks: tuple[float | None, ...] = ()  # of each camera: s to be added to its stamps, as its own calibration has it
     imu_file: Path | None = None
     samples: ImuRows | None = None  # inertial ones, where there is no table of them
     findings: tuple[Finding, ...] = ()  # what doctor reports of its parts

@@ -49,7 +49,7 @@ def survey(path: Path) -> Survey:
     pair = _pair(root, errors) if imu_file is None else None
     if pair is not None:
         _, imu_noise, T_body_imu, imu_calibration = _imu(root, errors, pair[0].rates.path)
-    cameras, rig = _cameras(root, T_body_imu, problems, errors)
+    cameras, rig, clocks = _cameras(root, T_body_imu, problems, errors)
     depth, how = _depth(root, rig, problems, errors)
     if rig is not None and depth is not None:
         rig = Rig(rig.cameras, rig.T_body_cams, has_depth=True)
@@ -60,6 +60,7 @@ def survey(path: Path) -> Survey:
         cameras=cameras,
         depth=depth,
         rig=rig,
+        clocks=clocks,
         imu_file=imu_file,
         samples=None if pair is None else pair[0],
         findings=() if pair is None else (pair[1],),
@@ -113,8 +114,8 @@ def _imu(
 
 def _cameras(
     root: Path, T_body_imu: Array, problems: Problems, errors: list[DataError]
-) -> tuple[tuple[ImageList, ...], Rig | None]:
-    """Return image lists and rig of cam0 and, if there is one, cam1, in the IMU's frame."""
+) -> tuple[tuple[ImageList, ...], Rig | None, tuple[float | None, ...]]:
+    """Return image lists, rig and clocks of cam0 and, if there is one, cam1, in the IMU's frame."""
     lists: list[ImageList] = []
     found: list[CameraFile] = []
     for index in range(_MAX_CAMERAS):
@@ -133,9 +134,10 @@ def _cameras(
         except DataError as error:
             errors.append(error)
     if not lists or len(lists) != len(found):
-        return tuple(lists), None
+        return tuple(lists), None, ()
     poses = tuple(invert(T_body_imu) @ camera.T_body_cam for camera in found)
-    return tuple(lists), Rig(tuple(camera.camera for camera in found), poses)
+    rig = Rig(tuple(camera.camera for camera in found), poses)
+    return tuple(lists), rig, tuple(camera.clock_s for camera in found)
 
 
 def _camera_file(root: Path, index: int) -> CameraFile:
@@ -148,7 +150,7 @@ def _camera_file(root: Path, index: int) -> CameraFile:
     chain = read_cameras(kalibr)
     if index >= len(chain) or chain[index].T_body_cam is None:
         raise DataError(f"{kalibr} has no cam{index} with T_cam_imu; add it, or write {sensor}: {CAMERA_EXAMPLE}")
-    return CameraFile(chain[index].camera, np.asarray(chain[index].T_body_cam))
+    return CameraFile(chain[index].camera, np.asarray(chain[index].T_body_cam), clock_s=chain[index].time_offset_s)
 
 
 def _kalibr(root: Path, name: str) -> Path | None:
