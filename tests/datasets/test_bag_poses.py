@@ -108,3 +108,32 @@ def test_one_topic_of_poses_needs_no_name_and_a_damaged_bag_gives_one_line(tmp_p
     path.write_bytes(b"#ROSBAG V2.0\n" + bytes(200))
     with pytest.raises(DataError):
         trajectory_of_topic(path, "/path")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_frames_of_a_tree_of_transforms_are_a_trajectory(kind: str, tmp_path: Path) -> None:
+    types = types_of(kind)
+
+    def moved(x_m: float) -> np.ndarray:
+        T = np.eye(4)
+        T[:3, :3], T[0, 3] = Rotation.from_euler("Z", 0.1 * x_m).as_matrix(), x_m
+        return T
+
+    tree = (
+        Message(t, "/tf", types.transforms(t, [("odom", "base_link", moved(0.1 * k)), ("map", "odom", moved(5.0))]))
+        for k in range(COUNT)
+        for t in [START_NS + k * 100_000_000]
+    )
+    path = write_bag(tmp_path, kind, tree)
+    found, words = trajectory_of_topic(path, "/tf:odom:/base_link")
+    np.testing.assert_allclose(found.positions_m[:, 0], 0.1 * np.arange(COUNT))
+    assert found.has_rotation and words.startswith("/tf:odom:/base_link, ") and "60 poses over 5.9 s" in words
+    for name, told in (
+        ("/tf", "topic=/tf: it holds transforms between many frames; name two: /tf:odom:base_link"),
+        ("tf:map:base_link", "no transform map:base_link on /tf; there are map:odom, odom:base_link"),
+        ("/tf:odom", "no transform odom on /tf; there are map:odom, odom:base_link"),
+        ("/none:a:b", "topic=/none: no such topic"),
+    ):
+        with pytest.raises(DataError) as refused:
+            trajectory_of_topic(path, name)
+        assert told in str(refused.value)

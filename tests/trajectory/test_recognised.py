@@ -169,7 +169,8 @@ def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
         (b"a,b,c\nd,e,f\n", "could not convert"),
         (b"1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", "poses:2: NaN"),
         (b"1 nan nan nan nan nan nan nan\n", "only 1 rows of NaN"),
-        (b"2 0 0 0 0 0 .6 .8\n1 0 0 0 0 0 .6 .8\n", "sort the file"),
+        (b"1 0 0 0 0 0 0 1\n2 0 0 0 0 0\n3 0 0 0 0 0 0 1", "poses:2: 6 columns, where the first row has 8"),
+        (b"1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1 9", "poses:2: 9 columns, where the first row has 8"),
         (b"timestamp,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0\n", "poses:2: 7 columns, where the header has 8"),
     ],
 )
@@ -178,6 +179,33 @@ def test_what_is_no_trajectory_is_named_for_what_it_is(data: bytes, message: str
     path.write_bytes(data)
     with pytest.raises(DataError, match=message):
         recognise(path)
+
+
+def test_rows_out_of_order_are_sorted_and_a_cut_line_is_left_out_which_is_stated(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    rows = [f"{t} {10 * t} 0 0 0 0 .6 .8" for t in (1, 3, 2, 4, 5)]
+    path.write_text("\n".join([*rows, "6 60 0 0"]))
+    found = recognise(path)
+    assert found.taken_for.endswith(
+        "; 5 poses over 4.0 s; last line cut short, left out; time goes back 1 times: sorted"
+    )
+    np.testing.assert_array_equal(found.trajectory.positions_m[:, 0], [10, 20, 30, 40, 50])
+    path.write_text("\n".join(rows))  # a last line without end, but with all numbers, is whole
+    assert "5 poses" in recognise(path).taken_for and "cut" not in recognise(path).taken_for
+
+
+@pytest.mark.parametrize("names", ["timestamp(s) q p v bg ba cam_imu_dt num_cam etc",
+                                   "timestamp(s) qx qy qz qw px py pz vx vy vz etc"])  # fmt: skip
+def test_states_of_openvins_are_read_by_their_names(names: str, tmp_path: Path) -> None:
+    path = tmp_path / "state_estimate.txt"
+    numbers = " ".join(["0.25"] * 12)
+    path.write_text(f"# {names}\n" + "".join(f"{t}.5 0 0 .6 .8 {t} 2 3 {numbers}\n" for t in range(1, 9)))
+    found = recognise(path)
+    assert found.taken_for.startswith("columns by their names, seconds; 8 poses over 7.0 s")
+    np.testing.assert_array_equal(found.trajectory.positions_m[1], [2, 2, 3])
+    np.testing.assert_allclose(
+        found.trajectory.T_world_body[0, :3, :3], Rotation.from_quat([0, 0, 0.6, 0.8]).as_matrix(), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("turn", ["", " 0 0 0 0", " 0 0 0 1", " 1 0 0 0", " nan nan nan nan"])

@@ -47,6 +47,7 @@ _TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp"}
 _TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot", "ori", "o"}
 _PLACES = {"p", "pos", "position", "t", "translation", "trans", "location"}
 _RATES = {"v", "vel", "velocity", "twist", "linear", "angular", "b", "bias", "cov", "covariance", "sigma", "std", "acc"}
+_WHOLE = {"q": ["qx", "qy", "qz", "qw"], "p": ["px", "py", "pz"]}
 _KITTI_HZ = 10
 
 
@@ -90,15 +91,20 @@ def recognise(path: Path, times: Path | None = None) -> Recognised:
     """
     _refuse_others(path)
     layout = _layout(path)
-    stamps, numbers, lines, lost = _rows(path, layout)
+    stamps, numbers, lines, lost, is_cut = _rows(path, layout)
     if not len(numbers):
         raise DataError(f"{path} holds no poses" + (f", only {lost} rows of NaN" if lost else ""))
     left_out = f"; {lost} rows of NaN left out" if lost else ""
+    left_out += "; last line cut short, left out" if is_cut else ""
     if layout.stamp is None:
         return _without_stamps(path, times, layout, numbers, lines)
     if times is not None:
         raise DataError(f"{path} has times of its own ({layout.name}); leave out the option for {times}")
     t_ns = np.array([stamp_ns(s, layout.unit_ns, path, n) for s, n in zip(stamps, lines, strict=True)], dtype=np.int64)
+    if backward := int(np.count_nonzero(np.diff(t_ns) < 0)):
+        order = np.argsort(t_ns, kind="stable")
+        t_ns, numbers, lines = t_ns[order], numbers[order], [lines[k] for k in order]
+        left_out += f"; time goes back {backward} times: sorted"
     if layout.matrix is not None:
         poses = kitti_poses(numbers, path, lines)
         found = trajectory_of_rows(t_ns, poses, path, lines)
@@ -144,7 +150,8 @@ def _layout(path: Path) -> _Layout:
         raise DataError(f"{path} holds no poses")
     separator = next((sign for sign in (",", ";") if sign in sample[0][1]), None)
     rows = [_fields(line, separator) for _, line in sample]
-    names = next((n for text in reversed(comments) if len(n := _fields(text, separator)) == len(rows[0])), [])
+    headers = [_fields(text, separator) for text in reversed(comments)]
+    names = next((n for n in headers if len(n) == len(rows[0])), []) or _beginning(headers, len(rows[0]))
     has_header = not any(_is_number(field) for field in rows[0])
     if has_header:
         names, rows = rows[0], rows[1:]
@@ -155,6 +162,18 @@ def _layout(path: Path) -> _Layout:
         stated, stamp, position, quaternion, unit_ns = named
         return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header)
     return _by_numbers(path, sample[has_header][0], separator, rows, has_header)
+
+
+def _beginning(headers: list[list[str]], width: int) -> list[str]:
+    """Return the names of the columns of a wider table, of which the first are a pose's; empty without any.
+
+    OpenVINS names its states so, and all columns of one quantity at once: timestamp(s) q p v bg ba.
+    """
+    for names in headers:
+        whole = [axis for name in names[:8] for axis in _WHOLE.get(name, [name])][:8]
+        if width > 8 and sorted(map(_role, whole)) == sorted(["t", "px", "py", "pz", "qx", "qy", "qz", "qw"]):
+            return whole + [""] * (width - 8)
+    return []
 
 
 def _by_names(
@@ -272,23 +291,28 @@ def _fields(line: str, separator: str | None) -> list[str]:
     return fields[:-1] if separator is not None and fields and not fields[-1] else fields
 
 
-def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int]:
-    """Return stamps, the numbers of poses [N, 3, 7 or 12], lines [N], and how many rows had NaN in the place of all."""
+def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int, bool]:
+    """Return stamps, the numbers of poses [N, 3, 7 or 12], lines [N], how many rows were NaN, if the last is cut."""
     used: Sequence[int] = (*layout.position, *layout.quaternion)
     if layout.matrix is not None:
         used = range(layout.matrix, layout.matrix + 12)
     stamps: list[str] = []
     rows: list[list[float]] = []
     lines: list[int] = []
-    skip = layout.header
+    skip, cut = layout.header, None
     for number, line in data_lines(path):
         if skip:
             skip = False
             continue
+        if cut is not None:
+            raise cut
         fields = _fields(line, layout.separator)
         if len(fields) != layout.width:
             first = "header" if layout.header else "first row"
-            raise DataError(f"{path}:{number}: {len(fields)} columns, where the {first} has {layout.width}")
+            cut = DataError(f"{path}:{number}: {len(fields)} columns, where the {first} has {layout.width}")
+            if len(fields) > layout.width or _ends(path):
+                raise cut
+            continue
         try:
             if "_" in line and any("_" in fields[k] for k in used):  # Python would read 1_0 as ten
                 raise ValueError("'_' is not part of a number")
@@ -306,4 +330,11 @@ def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int
     finite = np.isfinite(numbers).all(axis=1)
     if not finite.all():
         raise DataError(f"{path}:{lines[int(np.argmin(finite))]}: NaN or infinity; remove or repair the line")
-    return stamps, numbers, lines, int(len(kept) - len(index))
+    return stamps, numbers, lines, int(len(kept) - len(index)), cut is not None
+
+
+def _ends(path: Path) -> bool:
+    """Return whether the last line of a file has an end."""
+    with open_file(path) as file:
+        file.seek(-1, 2)
+        return file.read() == b"\n"

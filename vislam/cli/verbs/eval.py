@@ -31,7 +31,7 @@ class EvalOptions:
     reference: Path | None = None
     """True trajectory, as the estimate; a run folder brings its own"""
     topic: str = ""
-    """Of a bag: topic of poses (Odometry, PoseStamped, TransformStamped, Path, ...); default: its only one"""
+    """Of a bag: topic of poses (Odometry, PoseStamped, Path, ...), or /tf:odom:base_link; default: its only one"""
     reference_topic: str = ""
     """Of a bag as --reference"""
     times: Path | None = None
