@@ -173,7 +173,8 @@ RATIONAL = RATIONAL.replace("plumb_bob", "rational_polynomial").replace("0.5]", 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("camera_matrix: {rows: 3, cols: 3, data: [1, 2]}\nimage_width: 4\nimage_height: 4\n", "must be 9"),
+        ("camera_matrix: {rows: 3, cols: 3, data: [1, 2]}\nimage_width: 4\nimage_height: 4\n", "camera_matrix must"),
+        ("cam0:\n  camera_model: omni\n  intrinsics: [1.2, 50, 50, 32, 24]\n", "'omni', 'none' is not supported"),
         (RATIONAL, "not supp"),
         (camchain_text([CameraCalibration(CAMERA, np.eye(4))], "").replace("1.0, 0.0]", "2.0, 0.0]"), "not a rigid"),
         (camera_info_text(CAMERA, "c").replace("image_width: 64", "image_width: wide"), "image_width"),

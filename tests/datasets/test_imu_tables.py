@@ -1,5 +1,6 @@
 """Gyroscope and accelerometer in two files, as loggers write them: joined as the two topics of a bag are."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -136,3 +137,23 @@ def test_columns_that_are_not_known_are_refused(tmp_path, head, row, told):
     with pytest.raises(DataError) as refused:
         open_dataset(str(tmp_path))
     assert told in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_files_that_cannot_be_opened_and_clocks_that_differ_are_named(tmp_path):
+    (tmp_path / "imu.yaml").write_text(mini.IMU_YAML)
+    write(tmp_path / "gyro.csv", "", euroc_row, GYRO_NS, rate(GYRO_NS))
+    write(tmp_path / "accel.csv", "", euroc_row, ACCEL_NS - ACCEL_NS[0], force(ACCEL_NS))
+    for change, told in (
+        (
+            lambda path: path,
+            "no gyroscope sample has forces before and after it within 0.1 s: the last is at 140000000",
+        ),
+        (lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"), "a Git LFS pointer"),
+        (lambda path: (path.unlink(), path.symlink_to("nowhere")), "accel.csv cannot be read: No such file"),
+        (lambda path: (path.unlink(), os.mkfifo(path)), "accel.csv cannot be read"),
+        (lambda path: (path.unlink(), path.write_text("1e400,1,2,3\n" * 50)), "no rows of a stamp and x, y, z"),
+    ):
+        change(tmp_path / "accel.csv")
+        with pytest.raises(DataError) as refused:
+            imu(f"phone:{tmp_path}")
+        assert told in str(refused.value) and "\n" not in str(refused.value)

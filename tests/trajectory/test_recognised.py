@@ -166,6 +166,13 @@ def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
         (b"1 2 3 4 5 6 7 8 9 10 11 12 13\n", "13 numbers"),
         (b"1 0 0 0 0 0 0 1\n2 0 0 0 0 0\n", "poses:2: 6 columns, where the first row has 8"),
         (b"time,x,y,z\n", "no poses"),
+        (b'{"poses": [1, 2]}', "is JSON; save its poses as text"),
+        (b"<!DOCTYPE html><html>404</html>\n", "a web page or XML, perhaps in place of the file"),
+        (b"1,5 0,0 0,0 0,0 0,0 0,0 0,0 1,0\n", "poses:1: .*commas stand for decimal points"),
+        (b"1,5;0,0;0,0;0,0;0,0;0,0;0,0;1,0\n", "poses:1: .*commas stand for decimal points"),
+        (b"timestamp,latitude,longitude,altitude\n1,48,11,500\n", "latitude and longitude .* no metres; convert them"),
+        (b"# time lat lon alt\n1 48 11 500\n", "latitude and longitude .* no metres; convert them"),
+        (b"frame,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n", "no column is a time, the first is 'frame'; put the time"),
         (b"a,b,c\nd,e,f\n", "could not convert"),
         (b"1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", "poses:2: NaN"),
         (b"1 nan nan nan nan nan nan nan\n", "only 1 rows of NaN"),
@@ -192,6 +199,14 @@ def test_rows_out_of_order_are_sorted_and_a_cut_line_is_left_out_which_is_stated
     np.testing.assert_array_equal(found.trajectory.positions_m[:, 0], [10, 20, 30, 40, 50])
     path.write_text("\n".join(rows))  # a last line without end, but with all numbers, is whole
     assert "5 poses" in recognise(path).taken_for and "cut" not in recognise(path).taken_for
+
+
+def test_quoted_fields_and_comments_in_any_encoding_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    names = ",".join(f'"{name}"' for name in ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    rows = "".join(f'"{t}","{t}.5","0","0","0","0",".6",".8"\n' for t in range(1, 5))
+    path.write_bytes(f"# Gerät\n{names}\n{rows}".encode("latin-1"))
+    np.testing.assert_array_equal(recognise(path).trajectory.positions_m[:, 0], [1.5, 2.5, 3.5, 4.5])
 
 
 @pytest.mark.parametrize("names", ["timestamp(s) q p v bg ba cam_imu_dt num_cam etc",

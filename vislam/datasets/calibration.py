@@ -217,14 +217,14 @@ def depth_format(path: Path, camera: Camera) -> DepthFormat:
 
 def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:
     """Return the camera in the keys that ASL and Kalibr share; raises DataError naming the key."""
-    width, height = numbers_in(data, "resolution", path, 2)
-    fx, fy, cx, cy = numbers_in(data, "intrinsics", path, 4)
     name = str(data.get("distortion_model", "none")).lower()
     model = MODELS.get(name)
     if str(data.get("camera_model", "pinhole")).lower() != "pinhole" or model is None:
         raise DataError(
             f"{path}: '{data.get('camera_model')}', '{name}' is not supported; use pinhole with {[*MODELS]}"
         )
+    width, height = numbers_in(data, "resolution", path, 2)
+    fx, fy, cx, cy = numbers_in(data, "intrinsics", path, 4)
     coefficients = numbers_in(data, coefficients_key, path) if model != "none" else []
     skew = numbers_in({"skew_px": [data.get("skew_px", 0.0)]}, "skew_px", path, 1)[0]
     stated = {key: optional_positive(data, name, path, allow_zero=True) for key, name in SIGMA_KEYS.items()}

@@ -283,7 +283,7 @@ def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Array:
 
 def _matrix(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
     holder = data.get(key)
-    return numbers_in(holder if isinstance(holder, dict) else {"data": holder}, "data", path, count)
+    return numbers_in({key: holder.get("data") if isinstance(holder, dict) else holder}, key, path, count)
 
 
 def _pose(data: Keys, key: str, path: Path) -> Array | None:

@@ -149,7 +149,7 @@ def _files(folder: Path, kind: str, not_kind: str, beginning: str = "") -> Itera
     """Yield the tables in a folder whose names hold one kind and not the other."""
     if not folder.is_dir():
         return
-    there = [file for file in folder.iterdir() if file.suffix.lower() in (".csv", ".txt") and file.is_file()]
+    there = [file for file in folder.iterdir() if file.suffix.lower() in (".csv", ".txt") and not file.is_dir()]
     inner = [inside for inside in folder.iterdir() if not beginning and inside.is_dir()]
     for file in sorted([*there, *(data for one in inner if (data := one / "data.csv").is_file())]):
         name = _name(file).removeprefix(beginning.lower())
@@ -168,12 +168,17 @@ def _separator(line: str) -> str | None:
 
 def _columns(path: Path) -> tuple[Table, str]:
     """Return the table of a file and in words how its stamps and units are taken."""
-    with open_file(path) as file:
+    try:
+        file = open_file(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    with file:
         lines = [file.readline(MAX_LINE_BYTES).decode("utf-8", errors="replace") for _ in range(_LOOKED_AT)]
     separator = next((_separator(line) for line in reversed(lines[:-1]) if line.strip()), None)
     names = header(path, separator)
     split = [line.split(separator) for line in lines if line.endswith("\n")]
     sample = np.array([row[:4] for row in split if len(row) >= 4 and all(map(is_number, row[:4]))], dtype=float)
+    sample = sample[np.isfinite(sample).all(axis=-1)]
     if len(sample) < 2:
         raise DataError(f"{path}: no rows of a stamp and x, y, z are found in its first {_LOOKED_AT}; export it again")
     stamp, axes, factor, unit = 0, (1, 2, 3), 1.0, ""
@@ -191,6 +196,7 @@ def _columns(path: Path) -> tuple[Table, str]:
     elif _rises(sample[:, 3]) and not (_rises(sample[:, 0]) and sample[-1, 0] > sample[-1, 3]):
         stamp, axes = 3, (0, 1, 2)
     inside = [float(row[stamp]) for row in split if len(row) > stamp and is_number(row[stamp])]
+    inside = [number for number in inside if math.isfinite(number)]
     name, unit_ns = _stamp_unit(names[stamp] if names else "", np.array(inside))
     return Table(path, axes, stamp, _parser(unit_ns), factor, separator), f"stamps in {name}{unit}"
 

@@ -111,7 +111,10 @@ def data_lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[
                 number += 1
                 if len(raw) == _MAX_LINE_BYTES:
                     raise DataError(f"{path}:{number}: line longer than {_MAX_LINE_BYTES} bytes; not a trajectory file")
-                line = raw.decode("utf-8").strip().removeprefix("\ufeff")  # the mark of bytes' order
+                is_comment = raw.startswith((b"#", b"%"))  # which may be in any encoding
+                line = (
+                    raw.decode("utf-8", "replace" if is_comment else "strict").strip().removeprefix("\ufeff")
+                )  # the mark of bytes' order
                 if line and not line.startswith(("#", "%")):
                     yield number, line
                 elif line and comments is not None:

@@ -35,6 +35,8 @@ _OTHERS = {
     b"\xff\xfe": "UTF-16 or not text; save it as UTF-8",
     b"#ROSBAG": "a bag; give its topic: --topic or --reference-topic",
     b"\x89MCAP": "a bag; give its topic: --topic or --reference-topic",
+    b"{": "JSON; save its poses as text: t x y z qx qy qz qw",
+    b"<": "a web page or XML, perhaps in place of the file; download it again",
     b"SQLite format 3": "a database; of a bag give the topic: --topic or --reference-topic",
 }
 _SAMPLE = 100  # rows by which a file is recognised
@@ -48,6 +50,8 @@ _TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot", "ori", "o
 _PLACES = {"p", "pos", "position", "t", "translation", "trans", "location"}
 _RATES = {"v", "vel", "velocity", "twist", "linear", "angular", "b", "bias", "cov", "covariance", "sigma", "std", "acc"}
 _WHOLE = {"q": ["qx", "qy", "qz", "qw"], "p": ["px", "py", "pz"]}
+_DEGREES = {"lat", "latitude", "lon", "lng", "longitude"}
+_COUNTED = {"frame", "frames", "index", "idx", "id", "seq", "image", "keyframe", "kf"}
 _KITTI_HZ = 10
 
 
@@ -155,13 +159,14 @@ def _layout(path: Path) -> _Layout:
     has_header = not any(_is_number(field) for field in rows[0])
     if has_header:
         names, rows = rows[0], rows[1:]
+    _refuse_names(path, names)
     if not rows:
         raise DataError(f"{path} holds names of columns, but no poses")
     width = len(names if has_header else rows[0])
     if (named := _by_names(names, separator, width, rows)) is not None:
         stated, stamp, position, quaternion, unit_ns = named
         return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header)
-    return _by_numbers(path, sample[has_header][0], separator, rows, has_header)
+    return _by_numbers(path, sample[has_header], separator, rows, has_header)
 
 
 def _beginning(headers: list[list[str]], width: int) -> list[str]:
@@ -174,6 +179,17 @@ def _beginning(headers: list[list[str]], width: int) -> list[str]:
         if width > 8 and sorted(map(_role, whole)) == sorted(["t", "px", "py", "pz", "qx", "qy", "qz", "qw"]):
             return whole + [""] * (width - 8)
     return []
+
+
+def _refuse_names(path: Path, names: list[str]) -> None:
+    """Raise DataError for columns that are named, but hold neither metres nor times."""
+    if _DEGREES & {word for name in names for word in _words(name)}:
+        raise DataError(
+            f"{path} holds latitude and longitude ({', '.join(names)[:80]}), which are no metres; convert them to "
+            "east, north, up"
+        )
+    if names and not any(_role(name) == "t" for name in names) and _COUNTED & {*_words(names[0])}:
+        raise DataError(f"{path}: no column is a time, the first is '{names[0][:40]}'; put the time of each pose there")
 
 
 def _by_names(
@@ -219,13 +235,19 @@ def _words(name: str) -> list[str]:
     return re.findall(r"[a-z]+", name.lower())
 
 
-def _by_numbers(path: Path, line: int, separator: str | None, rows: list[list[str]], header: bool) -> _Layout:
+def _by_numbers(
+    path: Path, first_line: tuple[int, str], separator: str | None, rows: list[list[str]], header: bool
+) -> _Layout:
     """Return what rows without names hold, by how many numbers there are and what they are."""
+    line, text = first_line
     width, kind = len(rows[0]), "separated by blanks" if separator is None else f"separated by '{separator}'"
     try:
         first = np.array([float(field) for field in rows[0]])
     except ValueError as error:
-        raise DataError(f"{path}:{line}: {error}; no row of numbers, and no names of columns before it") from error
+        why = "no row of numbers, and no names of columns before it"
+        if re.fullmatch(r"(-?\d+,\d+[\s;]*)+", text):
+            why = "commas stand for decimal points; save it with points"
+        raise DataError(f"{path}:{line}: {error}; {why}") from error
     if width == 12 and _is_pose(first):
         return _Layout("KITTI", separator, width, None, matrix=0, header=header)
     if width == 16 and _is_pose(first[:12]):
@@ -287,7 +309,7 @@ def _is_number(field: str) -> bool:
 
 def _fields(line: str, separator: str | None) -> list[str]:
     """Return the fields of a line, without an empty one behind the last separator."""
-    fields = [field.strip() for field in line.split(separator)]
+    fields = [field.strip(' \t"') for field in line.split(separator)]
     return fields[:-1] if separator is not None and fields and not fields[-1] else fields
 
 
