@@ -55,7 +55,7 @@ def main() -> None:
         points, _ = surface_points(true, view, frame.T_world_body)
         exact.add(Cloud(points, np.zeros((len(points), 3), np.uint8)))
     fused = noisy.cloud(config.cloud_min_points, config.resolution_m)
-    cloud = without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
+    cloud = without_outliers(fused, config.cloud_outlier_sigma, config.resolution_m)
     truth = exact.cloud().points_m.astype(np.float64)
     tree = cKDTree(truth)
     error_m, at_edge = compared(tree, truth, cloud.points_m)

@@ -74,15 +74,15 @@ def test_stray_points_are_outliers_and_a_wall_is_not():
     wall = np.column_stack([rng.uniform(0, 3, 4000), rng.uniform(0, 3, 4000), 0.005 * rng.normal(size=4000)])
     stray = rng.uniform([0, 0, 1.0], [3, 3, 3.0], (15, 3))
     points = np.concatenate([wall, stray]).astype(np.float32)
-    kept = without_outliers(Cloud(points, np.zeros((4015, 3), np.uint8)), 12, 2.5, 0.1)
+    kept = without_outliers(Cloud(points, np.zeros((4015, 3), np.uint8)), 2.5, 0.1)
     assert (kept.points_m[:, 2] > 0.5).sum() == 0
     assert len(kept) > 3900
 
 
 def test_a_handful_of_points_passes_the_outlier_filter():
     cloud = random_cloud(5)
-    assert len(without_outliers(cloud, 12, 2.5, 0.1)) == 5
-    assert len(without_outliers(random_cloud(0), 12, 2.5, 0.1)) == 0
+    assert len(without_outliers(cloud, 2.5, 0.1)) == 5
+    assert len(without_outliers(random_cloud(0), 2.5, 0.1)) == 0
 
 
 def test_open3d_reads_our_mesh(tmp_path):

@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vislam.config import MapConfig
 from vislam.core.errors import DataError
+from vislam.mapping.octree import CorrectedOccupancy
 from vislam.mapping.octree.occupancy import Occupancy, Octree
 from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
 from vislam.mapping.octree.query import ray_cast
@@ -226,6 +228,16 @@ def test_what_was_hit_at_the_maximum_range_stays_as_in_octomap_or_is_cleared_as_
     for _ in range(10):
         clearing.insert(both, origin, 2.0, insertion)
     assert clearing.state_at(wall) == Occupancy.OCCUPIED, "a point in it wins over the ray"
+
+
+@pytest.mark.parametrize(("clears", "state"), [(False, Occupancy.OCCUPIED), (True, Occupancy.FREE)])
+def test_a_setting_has_a_run_clear_what_was_hit_at_the_maximum_range(clears, state):
+    origin, wall, far = np.full(3, 0.05), np.array([[2.04, 0.05, 0.05]]), np.array([[5.0, 0.05, 0.05]])
+    config = MapConfig(resolution_m=0.1, clears_at_range=clears)
+    grid = CorrectedOccupancy(config, None, None).occupancy
+    for scan in [wall] * 3 + [far] * 10:
+        grid.insert(scan, origin, 2.0)
+    assert grid.state_at(wall) == state
 
 
 def test_a_point_beyond_the_range_in_the_voxel_at_the_range_does_not_clear_it():

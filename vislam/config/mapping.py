@@ -91,6 +91,7 @@ class MapConfig:
     miss_probability: Probability = 0.32
     # of an occupied voxel that touches what the same scan hit: the ray grazes a surface; OctoMap's is the one above
     miss_beside_probability: Probability = 0.46
+    clears_at_range: bool = False  # a ray cut off at max_range_m clears the voxel that it ends in; OctoMap's does not
     clamp_max_probability: Probability = 0.9  # clamping here, three clear a voxel: a person who left is gone within 1 s
     clamp_min_probability: Probability = 0.1192  # OctoMap's: what was free for long is occupied after three scans
     min_range_m: NonNegative = 0.3  # nearer, structured-light depth and stereo matching are not valid
@@ -107,8 +108,8 @@ class MapConfig:
     rebuild_keyframes_per_call: Whole = 8  # that cast rays again in one call while a correction is followed; 3 ms each
     cloud_voxel_m: Cell = 0.015  # one averaged point per voxel in cloud.ply
     cloud_min_points: Whole = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
-    cloud_neighbours: Whole = 12  # statistical outlier removal: mean distance to so many neighbours
-    cloud_outlier_sigma: NonNegative = 2.5  # may exceed the average by so many standard deviations
+    # statistical outlier removal: mean distance to neighbours may exceed the average by so many standard deviations
+    cloud_outlier_sigma: NonNegative = 2.5
     # radius of moving least squares, three voxels or more; 0: points as measured
     cloud_smooth_m: Annotated[float, Range(0.0, 10.0)] = 0.0
     grid_floor_m: Finite | None = None  # height of the floor in map; None: the lowest large horizontal surface

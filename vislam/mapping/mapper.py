@@ -169,7 +169,7 @@ class Mapper:
         fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
-        kept = without_outliers(fused, config.cloud_neighbours, config.cloud_outlier_sigma, config.resolution_m)
+        kept = without_outliers(fused, config.cloud_outlier_sigma, config.resolution_m)
         return smoothed(kept, config.cloud_smooth_m)
 
     def coloured_octree(self) -> OctreeLeaves:

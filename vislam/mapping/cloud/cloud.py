@@ -19,6 +19,7 @@ _KEY_BITS = 21
 _KEY_HALF = 1 << (_KEY_BITS - 1)
 _COLUMNS = 8  # weighted sums of position and colour, sum of weights, number of points
 _FAINT_SHARE = 0.15  # of the usual weight of a voxel in its cell; what has less is the blur around a surface
+_NEIGHBOURS = 12  # of a point, whose mean distance shows whether it is alone
 _COARSER = 1.5  # a cloud that gets too large gets voxels larger by this
 
 
@@ -178,17 +179,17 @@ def voxel_filter(cloud: Cloud, voxel_m: float) -> Cloud:
     return average.cloud()
 
 
-def without_outliers(cloud: Cloud, neighbours: int, sigma: float, cell_m: float) -> Cloud:
-    """Return the points of cells whose mean distance to their `neighbours` is not `sigma` deviations above the average.
+def without_outliers(cloud: Cloud, sigma: float, cell_m: float) -> Cloud:
+    """Return the points of cells whose mean distance to 12 neighbours is not `sigma` deviations above the average.
 
     Statistical outlier removal (Rusu et al., "Towards 3D point cloud based object maps", 2008) on one point per cell of
     `cell_m`: as good at finding stray points, and its cost does not depend on how fine the cloud is.
     """
     cell_of = cells_of(cloud.points_m, cell_m)
     counts = np.bincount(cell_of)
-    if len(counts) <= neighbours:
+    if len(counts) <= _NEIGHBOURS:
         return cloud
     centres = np.stack([np.bincount(cell_of, weights=cloud.points_m[:, axis]) / counts for axis in range(3)], axis=1)
-    distances, _ = cKDTree(centres).query(centres, k=neighbours + 1)
+    distances, _ = cKDTree(centres).query(centres, k=_NEIGHBOURS + 1)
     mean = np.asarray(distances, dtype=np.float64)[:, 1:].mean(axis=1)
     return cloud.select((mean <= mean.mean() + sigma * mean.std())[cell_of])

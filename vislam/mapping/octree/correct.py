@@ -225,4 +225,5 @@ def _new_map(config: MapConfig) -> Octree:
         config.clamp_min_probability,
         config.clamp_max_probability,
         config.miss_beside_probability,
+        config.clears_at_range,
     )
