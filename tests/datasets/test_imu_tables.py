@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vislam.core import Problems
-from vislam.core.errors import DataError
+from vislam.core import DataError, Problems
 from vislam.core.messages import ImuSample
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.inspect import inspect
