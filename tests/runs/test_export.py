@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2.storage_mcap import McapReader
 from scipy.spatial.transform import Rotation
 
 from run_folder import FRAMES, PERIOD_NS, START_NS, make_run
@@ -16,6 +17,7 @@ from vislam.cli import run_verb
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import se3_exp
+from vislam.core.memory import FrameEntry
 from vislam.core.messages import NavState
 from vislam.mapping.drive.grid import Grid, read_grid, write_grid
 from vislam.mapping.formats.ply import write_ply
@@ -24,6 +26,7 @@ from vislam.runs.offline import export_mcap as exporting
 from vislam.runs.offline.export_mcap import export_mcap
 from vislam.runs.session import SessionWriter
 from vislam.trajectory import Trajectory, write_states_csv, write_tum
+from vislam.trajectory.motion import motion_of
 
 CAMERA = Camera(640, 480, 458.0, 457.0, 320.0, 240.0)
 RIG = Rig((CAMERA, CAMERA), (se3_exp(np.array([0.1, -0.2, 1.5, 0.01, 0.02, 0.03])), np.eye(4)))
@@ -38,13 +41,23 @@ def points() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run folder with a map and a session; its first states are those of a filter whose body is turned."""
+    """A run folder with a map and a session; its session has the filter's motion at every frame."""
     folder = make_run(tmp_path_factory.mktemp("exported") / "run", loops=2)
     write_ply(folder / "map" / "cloud.ply", points(), COLORS)
     write_grid(folder / "map", GRID)
     write_grid(folder / "map", Grid(1 - np.abs(CELLS), 0.1, (0.0, 0.0), 0.0), "drive")
-    SessionWriter.create(folder / "session.db", {"config": {}}, RIG, None, 9.81).close(finished=True)
+    writer = SessionWriter.create(folder / "session.db", {"config": {}}, RIG, None, 9.81)
+    ekf = load_run(folder).trajectories["ekf"]
+    for k, (t_ns, T) in enumerate(zip(ekf.t_ns.tolist(), ekf.T_world_body, strict=True)):
+        writer.add_frame(FrameEntry(t_ns, k // 10, None, T, motion=motion_of(state_of(t_ns, T, k))))
+    writer.close(finished=True)
     return folder
+
+
+def state_of(t_ns: int, T: np.ndarray, k: int) -> NavState:
+    """Return another state for each frame."""
+    A = np.random.default_rng(k).normal(size=(15, 15))
+    return NavState(t_ns, T, np.array([0.01 * k, -0.4, 0.3]), np.zeros(3), np.zeros(3), 1e-6 * (A @ A.T))
 
 
 @pytest.fixture(scope="module")
@@ -130,9 +143,30 @@ def test_where_the_filter_has_no_pose_odom_is_the_map(run, tmp_path):
     np.testing.assert_allclose(matrix(first[1].transform.translation, first[1].transform.rotation), pose, atol=1e-12)
 
 
-def test_odometry_has_the_covariance_of_its_keyframe_in_the_axes_of_odom(run, found):
-    loaded = load_run(run)
-    states, messages = loaded.states["ekf"], found["/odom"]
+def test_every_odometry_has_the_velocity_and_covariance_of_the_filter_at_its_frame(run, found):
+    poses = load_run(run).trajectories["ekf"].T_world_body
+    for k, (t_ns, message, _) in enumerate(found["/odom"]):
+        state, linear, R = state_of(t_ns, poses[k], k), message.twist.twist.linear, poses[k, :3, :3]
+        np.testing.assert_allclose(R @ [linear.x, linear.y, linear.z], state.velocity_world_m_s, atol=1e-12)
+        covariance = message.pose.covariance.reshape(6, 6)
+        np.testing.assert_allclose(covariance[:3, :3], state.covariance[3:6, 3:6], atol=1e-15)
+        np.testing.assert_allclose(covariance[3:, 3:], R @ state.covariance[:3, :3] @ R.T, atol=1e-15)
+        assert message.twist.covariance.reshape(6, 6)[:3, :3].diagonal().max() < 0.01
+    assert k == FRAMES - 1
+
+
+def test_chunks_are_packed(exported):
+    reader = McapReader(exported)
+    reader.open()
+    reader.read_index()
+    assert {chunk.compression for chunk in reader.chunks} == {"zstd"}
+
+
+def test_without_a_session_odometry_has_the_covariance_of_its_keyframes_alone(run, tmp_path):
+    bare = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("session.db"))
+    export_mcap(bare, tmp_path / "a.mcap")
+    loaded = load_run(bare)
+    states, messages = loaded.states["ekf"], read(tmp_path / "a.mcap")["/odom"]
     k = 5
     _, message, _ = messages[10 * k]
     assert stamp_ns(message) == states.t_ns[k] == START_NS + 10 * k * PERIOD_NS

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from vislam.cli import run_verb
 from vislam.config import VerdictConfig, load
@@ -13,6 +14,7 @@ from vislam.core import Reading
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.further_sensors import FurtherReadings
+from vislam.runs.offline.export_mcap import export_mcap
 from vislam.runs.report import write_report
 from vislam.runs.sources import open_source
 from vislam.runs.verdict import Evidence, judge
@@ -64,6 +66,15 @@ def test_a_run_without_a_camera_goes_on_where_it_was_ended(blind, tmp_path):
     assert (out / "tracking.csv").read_text() == (blind[0] / "tracking.csv").read_text()
     whole, again = (read_tum(of / "trajectory_graph.tum").positions_m for of in (blind[0], out))
     assert whole.shape == again.shape and np.abs(whole - again).max() < 0.1  # an IMU alone drifts
+    export_mcap(out, tmp_path / "a.mcap")
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        sent = [reader.deserialize(raw, of.msgtype) for of, _, raw in reader.messages() if of.topic == "/odom"]
+    causal = read_tum(out / "trajectory_ekf.tum")
+    assert len(sent) == len(causal) > 50
+    assert all(0.0 < message.twist.covariance[0] < 1.0 and message.pose.covariance[0] < 1e3 for message in sent)
+    steps = np.linalg.norm(np.diff(causal.positions_m, axis=0), axis=1) / np.diff(causal.t_ns * 1e-9)
+    speeds = [np.linalg.norm([m.twist.twist.linear.x, m.twist.twist.linear.y, m.twist.twist.linear.z]) for m in sent]
+    assert np.abs(steps - 0.5 * (np.array(speeds)[1:] + speeds[:-1])).max() < 0.1
 
 
 def test_a_map_is_refused_where_there_is_no_camera_to_recognise_it(blind, tmp_path, capsys):

@@ -132,6 +132,7 @@ def without_readings(path: Path) -> None:
         db.execute("DROP TABLE readings")
         db.execute("DROP TABLE own_starts")
         db.execute("DROP TABLE labels")
+        db.execute("DROP TABLE motions")
         db.execute("PRAGMA user_version=8")
 
 

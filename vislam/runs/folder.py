@@ -43,6 +43,7 @@ from vislam.runs.session import Session, has_frames
 from vislam.runs.sources import recorded_path
 from vislam.trajectory import Alignment, Trajectory, write_states_csv, write_tum
 from vislam.trajectory.frames import LoggedFrames
+from vislam.trajectory.motion import motion_of
 
 _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
@@ -338,6 +339,7 @@ class RunLog:
         entry = FrameEntry(
             front.frame.t_ns, front.keyframe_id, front.T_keyframe_body, front.T_odom_body, step.T_map_body,
             vo.tracking, vo.inliers, vo.keyframe_id, front.track.reason, step.localisation, step.submap,
+            None if front.state is None else motion_of(front.state),
         )  # fmt: skip
         self._frames.append(entry)
         if front.state is not None and front.track.keyframe is not None:

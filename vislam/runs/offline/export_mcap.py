@@ -18,8 +18,8 @@ import numpy as np
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.geometry import invert_many, skew
-from vislam.core.messages import Array
+from vislam.core.geometry import invert_many
+from vislam.core.messages import Array, NavState
 from vislam.factors import rig_from
 from vislam.mapping.drive.grid import read_grid
 from vislam.mapping.formats.ply import read_ply
@@ -27,6 +27,7 @@ from vislam.runs.loaded import KeyframeStates, LoadedRun, load_run
 from vislam.runs.offline.ros_messages import BASE, MAP, ODOM, UNKNOWN_VARIANCE, RosMessages, kept_for_late_joiners
 from vislam.runs.session import Session
 from vislam.trajectory import Trajectory
+from vislam.trajectory.motion import motion_of, motion_parts
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -162,13 +163,12 @@ def _write_poses(topics: _Topics, loaded: LoadedRun, poses: Trajectory, frame: s
     causal = {} if ekf is None else dict(zip(ekf.t_ns.tolist(), ekf.T_world_body, strict=True))
     if not causal:
         topics.left_out["/odom"] = f"{loaded.folder / 'trajectory_ekf.tum'} is not there, or holds no pose"
-    states = loaded.states.get("ekf")
-    rows = {} if states is None else {t_ns: k for k, t_ns in enumerate(states.t_ns.tolist())}
+    motions = _motions(loaded)
     placed = dict(zip(poses.t_ns.tolist(), poses.T_world_body, strict=True))
     for t_ns in sorted({*causal, *placed}):
         T_odom_body, T_map_body = causal.get(t_ns), placed.get(t_ns)
         if T_odom_body is not None:
-            _write_odometry(topics, t_ns, T_odom_body, states, rows.get(t_ns))
+            _write_odometry(topics, t_ns, T_odom_body, motions.get(t_ns))
         if T_map_body is not None:
             topics.write(
                 "/vislam/pose", "geometry_msgs/msg/PoseStamped", t_ns, topics.make.pose(t_ns, T_map_body, frame)
@@ -187,40 +187,40 @@ def _tree(T_map_body: Array, T_odom_body: Array | None) -> list[tuple[str, str, 
     return [(MAP, ODOM, T_map_body @ invert_many(T_odom_body[None])[0]), (ODOM, BASE, T_odom_body)]
 
 
-def _write_odometry(
-    topics: _Topics, t_ns: int, T_odom_body: Array, states: KeyframeStates | None, row: int | None
-) -> None:
+def _motions(loaded: LoadedRun) -> dict[int, Array]:
+    """Return the motion [30] of the filter by stamp: of every frame, of keyframes alone in a run of before."""
+    keyframes = loaded.states.get("ekf")
+    found = {} if keyframes is None else {state.t_ns: motion_of(state) for state in _as_states(keyframes)}
+    if (path := loaded.folder / "session.db").is_file():
+        session = Session(path)
+        try:
+            found |= {frame.t_ns: frame.motion for frame in session.frames() if frame.motion is not None}
+        finally:
+            session.close()
+    return found
+
+
+def _as_states(states: KeyframeStates) -> Iterator[NavState]:
+    columns = (states.T_world_body, states.velocity_world_m_s, states.gyro_bias_rad_s, states.accel_bias_m_s2)
+    for t_ns, *values in zip(states.t_ns.tolist(), *columns, states.covariance, strict=True):
+        yield NavState(t_ns, *values)
+
+
+def _write_odometry(topics: _Topics, t_ns: int, T_odom_body: Array, motion: Array | None) -> None:
     velocity, of_pose, of_velocity = np.zeros(3), _UNKNOWN_6, _UNKNOWN_3
-    if states is not None and row is not None:
-        velocity, of_pose, of_velocity = _as_ros(T_odom_body[:3, :3], states, row)
+    if motion is not None:
+        moves, pose, moving = motion_parts(motion)
+        of_pose = pose if np.isfinite(pose).all() else of_pose
+        if np.isfinite(moves).all() and np.isfinite(moving).all():
+            velocity, of_velocity = moves, moving
     data = topics.make.odometry(t_ns, T_odom_body, velocity, of_pose, of_velocity)
     topics.write("/odom", "nav_msgs/msg/Odometry", t_ns, data)
-
-
-def _as_ros(R: Array, states: KeyframeStates, row: int) -> tuple[Array, Array, Array]:
-    """Return velocity [3] in axes of the body, covariance [6, 6] of the pose in those of odom, and [3, 3] of velocity.
-
-    States perturb rotation on the body's side; what was not estimated, or is not finite, has the unknown variance.
-    """
-    covariance = states.covariance[row]
-    of_pose, of_velocity, velocity = _UNKNOWN_6, _UNKNOWN_3, np.zeros(3)
-    if np.isfinite(covariance[:6, :6]).all():
-        J = np.zeros((6, 6))
-        J[:3, 3:], J[3:, :3] = np.eye(3), R
-        of_pose = J @ covariance[:6, :6] @ J.T
-    known = np.r_[0:3, 6:9]
-    of_both = covariance[np.ix_(known, known)]
-    if np.isfinite(states.velocity_world_m_s[row]).all() and np.isfinite(of_both).all():
-        velocity = R.T @ states.velocity_world_m_s[row]
-        J = np.hstack([skew(velocity), R.T])
-        of_velocity = J @ of_both @ J.T
-    return velocity, of_pose, of_velocity
 
 
 @contextmanager
 def _bag(path: Path) -> Iterator[Writer]:
     """Open a bag that becomes the file `path` when the block ends well, and vanishes when it does not."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent))
@@ -228,6 +228,7 @@ def _bag(path: Path) -> Iterator[Writer]:
         raise StorageError(f"{path} cannot be written: {error.strerror}; choose another folder") from error
     try:
         bag = Writer(folder / path.stem, version=_VERSION, storage_plugin=StoragePlugin.MCAP)
+        bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)  # of MCAP's chunks
         bag.open()
         try:
             yield bag

@@ -15,6 +15,7 @@ from vislam.core.errors import DataError
 from vislam.runs.session.schema import (
     APPLICATION_ID,
     FIRST_WITH_LABELS,
+    FIRST_WITH_MOTIONS,
     FIRST_WITH_READINGS,
     OLDEST_VERSION,
     SCHEMA_VERSION,
@@ -44,7 +45,8 @@ _COVERED_READINGS: dict[str, tuple[tuple[int, ...], ...]] = {
     "own_starts": (tuple(range(5)),),
 }
 _COVERED_LABELS: dict[str, tuple[tuple[int, ...], ...]] = {"labels": (tuple(range(2)),)}
-_COVERED_ALL = _COVERED | _COVERED_READINGS | _COVERED_LABELS
+_COVERED_MOTIONS: dict[str, tuple[tuple[int, ...], ...]] = {"motions": (tuple(range(2)),)}
+_COVERED_ALL = _COVERED | _COVERED_READINGS | _COVERED_LABELS | _COVERED_MOTIONS
 _EXACT = 2**53  # whole numbers below are the same to SQLite, whether they were given as int or as float
 
 
@@ -79,6 +81,7 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
     with readable(path):
         tables = _COVERED | (_COVERED_READINGS if has_readings(db) else {})
         tables |= _COVERED_LABELS if has_labels(db) else {}
+        tables |= _COVERED_MOTIONS if has_motions(db) else {}
         for table, covered in tables.items():
             for number, row in enumerate(db.execute(f"SELECT * FROM {table}")):
                 count = len(row) - len(covered)
@@ -97,6 +100,11 @@ def has_readings(db: sqlite3.Connection) -> bool:
 def has_labels(db: sqlite3.Connection) -> bool:
     """Return whether a session has the table of labels: not one of an older format."""
     return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_LABELS)
+
+
+def has_motions(db: sqlite3.Connection) -> bool:
+    """Return whether a session has the table of the filter's motion at frames: not one of an older format."""
+    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_MOTIONS)
 
 
 def check_version(db: sqlite3.Connection, path: Path) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from vislam.core.messages import (
     Tracking,
 )
 from vislam.factors import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
-from vislam.runs.session.checks import check_records, check_sound, has_labels, has_readings
+from vislam.runs.session.checks import check_records, check_sound, has_labels, has_motions, has_readings
 from vislam.runs.session.packets import LIGHT_COLUMNS, packet_of
 from vislam.runs.session.reading_rows import readings_of, starts_of
 from vislam.runs.session.schema import (
@@ -42,6 +42,7 @@ from vislam.runs.session.schema import (
     state_of,
 )
 from vislam.trajectory.frames import LoggedFrames
+from vislam.trajectory.motion import MOTION_NUMBERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,6 +233,7 @@ class Session:
             return maybe_numbers(blob, "<f8", (4, 4))
 
         with readable(self.path):
+            motions = {t: numbers(blob, "<f8", (MOTION_NUMBERS,)) for t, blob in self._motion_rows()}
             return [
                 FrameEntry(
                     row[0],
@@ -245,9 +247,13 @@ class Session:
                     row[8],
                     Localisation(row[9]),
                     row[10],
+                    motions.get(row[0]),
                 )
                 for row in self._db.execute("SELECT * FROM frames ORDER BY t_ns")
             ]
+
+    def _motion_rows(self) -> Iterable[tuple[int, bytes]]:
+        return self._db.execute("SELECT t_ns, numbers FROM motions") if has_motions(self._db) else ()
 
     def states(self, whose: str) -> dict[int, NavState]:
         """Return the stored states of keyframes: of the "filter" in odom, or of the "graph"."""

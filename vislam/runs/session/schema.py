@@ -17,9 +17,9 @@ from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": distinguishes our files from other SQLite files
-SCHEMA_VERSION = 10
-OLDEST_VERSION = 8  # read as well; it knows no readings of other sensors, and no labels
-FIRST_WITH_READINGS, FIRST_WITH_LABELS = 9, 10
+SCHEMA_VERSION = 11
+OLDEST_VERSION = 8  # read as well; it knows nothing of what `_LATER` holds
+FIRST_WITH_READINGS, FIRST_WITH_LABELS, FIRST_WITH_MOTIONS = 9, 10, 11
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -97,7 +97,7 @@ CREATE TABLE vocabulary (
 );
 CREATE TABLE newest (one INTEGER PRIMARY KEY CHECK (one = 1), value TEXT NOT NULL, crc INTEGER NOT NULL);
 """
-READINGS_SCHEMA = """
+_READINGS = """
 CREATE TABLE readings (
     id INTEGER NOT NULL, number INTEGER NOT NULL, sensor TEXT NOT NULL, t_ns INTEGER NOT NULL,
     numbers BLOB NOT NULL, covariance BLOB, station BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (id, number)
@@ -107,15 +107,18 @@ CREATE TABLE own_starts (
     crc INTEGER NOT NULL, PRIMARY KEY (id, number)
 );
 """
-LABELS_SCHEMA = """
+_LABELS = """
 CREATE TABLE labels (id INTEGER PRIMARY KEY, png BLOB NOT NULL, crc INTEGER NOT NULL);
 """
+_MOTIONS = """
+CREATE TABLE motions (t_ns INTEGER PRIMARY KEY, numbers BLOB NOT NULL, crc INTEGER NOT NULL);
+"""
+_LATER = ((FIRST_WITH_READINGS, _READINGS), (FIRST_WITH_LABELS, _LABELS), (FIRST_WITH_MOTIONS, _MOTIONS))
 
 
 def schema(version: int) -> str:
     """Return the tables of a session of a format that is read here."""
-    readings = READINGS_SCHEMA if version >= FIRST_WITH_READINGS else ""
-    return SCHEMA + readings + (LABELS_SCHEMA if version >= FIRST_WITH_LABELS else "")
+    return SCHEMA + "".join(tables for first, tables in _LATER if version >= first)
 
 
 def to_bytes(values: NDArray[Any], dtype: str) -> bytes:

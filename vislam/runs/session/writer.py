@@ -28,14 +28,12 @@ from vislam.core.messages import Array, GraphUpdate, LoopCandidate, LoopDecision
 from vislam.core.up import Up
 from vislam.factors import rig_data, state_data
 from vislam.imu import ImuNoise
-from vislam.runs.session.checks import check_records, check_sound, checksum, checksums, has_labels, has_readings
+from vislam.runs.session.checks import check_records, check_sound, checksum, checksums
 from vislam.runs.session.packets import packet_row
 from vislam.runs.session.reader import Session
 from vislam.runs.session.reading_rows import own_data, reading_rows, start_rows
 from vislam.runs.session.schema import (
     APPLICATION_ID,
-    LABELS_SCHEMA,
-    READINGS_SCHEMA,
     SCHEMA_VERSION,
     maybe_bytes,
     numbers,
@@ -96,6 +94,7 @@ class SessionWriter:
             writer._bring_up()
             newest_id, newest_t_ns = db.execute("SELECT id, t_ns FROM keyframes ORDER BY id DESC").fetchone() or (-1, 0)
             db.execute("DELETE FROM frames WHERE t_ns > ? OR keyframe_id > ?", (newest_t_ns, newest_id))
+            db.execute("DELETE FROM motions WHERE t_ns NOT IN (SELECT t_ns FROM frames)")
             base = writer.base()
             writer._first_id = 0 if base is None else int(base["keyframes"])
             writer._edges = db.execute("SELECT COALESCE(MAX(number) + 1, 0) FROM edges").fetchone()[0]
@@ -119,7 +118,7 @@ class SessionWriter:
             base.copy_to(db)
             with writer._transaction():
                 writer._bring_up()
-                foreign = ("frames", "candidates", "retrieved", *(() if with_scans else ("scans", "labels")))
+                foreign = ("frames", "motions", "candidates", "retrieved", *(() if with_scans else ("scans", "labels")))
                 for table in foreign:
                     db.execute(f"DELETE FROM {table}")
                 db.execute("DELETE FROM states WHERE whose = 'filter'")
@@ -156,8 +155,8 @@ class SessionWriter:
 
     def _bring_up(self) -> None:
         """Give a session of an older format the tables that it lacks."""
-        lacking = ("" if has_readings(self._db) else READINGS_SCHEMA) + ("" if has_labels(self._db) else LABELS_SCHEMA)
-        if lacking:
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if lacking := schema(SCHEMA_VERSION).removeprefix(schema(version)):
             for statement in lacking.split(";"):
                 self._db.execute(statement)
             self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
@@ -273,6 +272,8 @@ class SessionWriter:
 
     def _write_frames(self) -> None:
         self._replace("frames", [_frame_row(frame) for frame in self._frames])
+        moving = [(frame.t_ns, to_bytes(frame.motion, "<f8")) for frame in self._frames if frame.motion is not None]
+        self._replace("motions", moving)
         self._frames = []
 
     def _set_info(self, entries: dict[str, Any]) -> None:
