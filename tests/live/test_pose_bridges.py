@@ -305,6 +305,94 @@ def test_an_autopilot_gets_the_pose_from_the_process_beside() -> None:
     assert (got[1].x, got[1].y, got[1].z) == (3.0, -2.0, -1.0)
 
 
+class FakeAutopilot:
+    """A clock of its own, a socket, and PX4's way of mapping stamps by TIMESYNC; time passes when it is let to."""
+
+    def __init__(self, boot_ns: int) -> None:
+        from pymavlink.dialects.v20 import common
+
+        self.now_ns = 50 * 10**9  # of the sender
+        self._boot_ns = boot_ns  # in the sender's clock
+        self._link, self._parser = common.MAVLink(None, 1, 1), common.MAVLink(None)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(600.0)  # only ends a hang
+        self.to = f"udp:127.0.0.1:{self.socket.getsockname()[1]}"
+        self.peer: tuple[str, int] | None = None
+
+    def clock_ns(self) -> int:
+        return self.now_ns - self._boot_ns
+
+    def receive(self, kind: str):
+        while True:
+            data, self.peer = self.socket.recvfrom(1024)
+            for message in self._parser.parse_buffer(data) or []:
+                if message.get_type() == kind:
+                    return message
+
+    def send(self, data: bytes) -> None:
+        self.socket.sendto(data, self.peer)
+
+    def ask(self, there_ns: int, back_ns: int) -> int:
+        """Return its clock less the sender's, taking both ways as equally long."""
+        asked_ns = self.clock_ns()
+        self.now_ns += there_ns
+        self.send(self._link.timesync_encode(0, asked_ns).pack(self._link))
+        answer = self.receive("TIMESYNC")
+        self.now_ns += back_ns
+        assert answer.ts1 == asked_ns
+        return (answer.ts1 + self.clock_ns()) // 2 - answer.tc1
+
+
+@needs_mavlink
+@pytest.mark.parametrize("boot_ns", [49 * 10**9, -(10**12)])
+def test_an_autopilot_maps_stamps_into_its_own_clock(boot_ns: int) -> None:
+    from vislam.live.bridges.mavlink import Mavlink
+
+    autopilot = FakeAutopilot(boot_ns)
+    wire = Mavlink(autopilot.to, "vislam-test", clock_ns=lambda: autopilot.now_ns)
+    try:
+        wire.send(known_pose(t_ns=autopilot.now_ns, published_ns=autopilot.now_ns))
+        autopilot.receive("ODOMETRY")
+        for garbage in (b"", b"\xfd", os.urandom(300), bytes(range(256)) * 4):
+            autopilot.send(garbage)
+        offset_ns = autopilot.ask(300_000, 900_000)
+        assert abs(offset_ns + boot_ns) <= 300_000  # half of what the ways differ
+        for age_ns in (7_000_000, 22_000_000):
+            autopilot.now_ns += 20_000_000
+            wire.send(known_pose(t_ns=autopilot.now_ns - age_ns, published_ns=autopilot.now_ns))
+            stamp_ns = autopilot.receive("ODOMETRY").time_usec * 1000 + offset_ns
+            assert abs(autopilot.clock_ns() - stamp_ns - age_ns) < 1_000_000
+    finally:
+        wire.close()
+        wire.close()
+        autopilot.socket.close()
+
+
+@needs_mavlink
+def test_what_is_no_request_is_not_answered_nor_who_is_not_the_autopilot() -> None:
+    from pymavlink.dialects.v20 import common
+
+    from vislam.live.bridges.mavlink import Mavlink
+
+    autopilot, link = FakeAutopilot(0), common.MAVLink(None, 1, 1)
+    wire = Mavlink(autopilot.to, "vislam-test", clock_ns=lambda: 5)
+    stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        wire.send(known_pose())
+        autopilot.receive("ODOMETRY")
+        assert autopilot.peer is not None and autopilot.peer[0] == "127.0.0.1"
+        stranger.sendto(link.timesync_encode(0, 11).pack(link), autopilot.peer)
+        autopilot.send(link.timesync_encode(7, 22).pack(link))  # an answer
+        autopilot.send(link.timesync_encode(0, 33).pack(link))
+        answer = autopilot.receive("TIMESYNC")
+        assert (answer.tc1, answer.ts1) == (5, 33)
+    finally:
+        wire.close()
+        stranger.close()
+        autopilot.socket.close()
+
+
 def test_poses_beyond_the_rate_are_left_out() -> None:
     from vislam.live.processes.child import Life
 

@@ -1,5 +1,7 @@
 """The published pose as MAVLink's ODOMETRY (#331), for autopilots. Needs pymavlink: only its own process imports this.
 
+Its stamps are of CLOCK_MONOTONIC. An autopilot learns that clock by TIMESYNC (#111): requests are answered with it.
+
 Axes forward-left-up become forward-right-down by a half turn about x, in `odom` (MAV_FRAME_LOCAL_FRD: its heading is
 arbitrary, as that of `odom` is) and in `base` (MAV_FRAME_BODY_FRD). https://mavlink.io/en/messages/common.html#ODOMETRY
 """
@@ -7,6 +9,10 @@ arbitrary, as that of `odom` is) and in `base` (MAV_FRAME_BODY_FRD). https://mav
 from __future__ import annotations
 
 import socket
+import time
+from collections.abc import Callable
+from select import select
+from threading import Event, Lock, Thread
 
 import numpy as np
 from pymavlink.dialects.v20 import common
@@ -23,18 +29,23 @@ _UPPER = np.triu_indices(6)
 _SYSTEM = 1  # the vehicle that the autopilot steers
 _HEARTBEAT_NS = 1_000_000_000
 _SEEN, _DOUBTED, _BLIND, _FAILED = 100, 50, 25, -1
+_LOOK_S = 0.1  # after which the end is looked for
+_DATAGRAM = 65536
 
 
 class Mavlink:
-    """Owns a socket that ODOMETRY goes to, with HEARTBEAT once a second."""
+    """Owns a socket that ODOMETRY goes to, with HEARTBEAT once a second, and a thread that answers TIMESYNC at once."""
 
-    def __init__(self, to: str, name: str, allow_remote: bool = False) -> None:
+    def __init__(
+        self, to: str, name: str, allow_remote: bool = False, clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
         """Open the socket.
 
         Args:
             to: "udp:HOST:PORT".
             name: of the pose, `live.name`.
             allow_remote: whether a host beyond this machine is meant.
+            clock_ns: the clock of the poses' stamps.
 
         Raises:
             UsageError: an address that is none, or beyond this machine without `allow_remote`.
@@ -44,6 +55,9 @@ class Mavlink:
         self._socket.setblocking(False)
         self._link = common.MAVLink(None, _SYSTEM, common.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY)
         self._heartbeat_ns = 0
+        self._clock_ns, self._sending, self._closed = clock_ns, Lock(), Event()
+        self._answering = Thread(target=self._answer, daemon=True)
+        self._answering.start()
 
     def send(self, pose: PublishedPose) -> None:
         """Send the pose; without a listener, nothing happens."""
@@ -57,16 +71,39 @@ class Mavlink:
         self._send(odometry(pose))
 
     def _send(self, message: common.MAVLink_message) -> None:
-        data = message.pack(self._link)
-        self._link.seq = (self._link.seq + 1) % 256
-        try:
-            self._socket.sendto(data, self._address)
-        except OSError:  # no listener there (yet), or one that is too slow
-            return
+        with self._sending:
+            data = message.pack(self._link)
+            self._link.seq = (self._link.seq + 1) % 256
+            try:
+                self._socket.connect(self._address)  # of others nothing is heard, nor beyond loopback if it is there
+                self._socket.send(data)
+            except OSError:  # no listener there (yet), or one that is too slow
+                return
+
+    def _answer(self) -> None:
+        while not self._closed.is_set():
+            if not select([self._socket], [], [], _LOOK_S)[0]:
+                continue
+            try:
+                data, now_ns = self._socket.recv(_DATAGRAM), self._clock_ns()
+            except OSError:  # it is told so that nobody listened to what was sent last
+                continue
+            for asked_ns in _timesync_requests(data):
+                self._send(self._link.timesync_encode(now_ns, asked_ns))
 
     def close(self) -> None:
         """Close the socket; may be called twice."""
+        self._closed.set()
+        self._answering.join()
         self._socket.close()
+
+
+def _timesync_requests(data: bytes) -> list[int]:
+    """Return the stamps of an autopilot that a datagram asks to be echoed; of garbage, none."""
+    parser = common.MAVLink(None)
+    parser.robust_parsing = True
+    found = parser.parse_buffer(data) or []
+    return [message.ts1 for message in found if message.get_type() == "TIMESYNC" and message.tc1 == 0]
 
 
 def odometry(pose: PublishedPose) -> common.MAVLink_odometry_message:
