@@ -9,6 +9,7 @@ import stat
 import subprocess
 import time
 import uuid
+from itertools import count, islice
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -72,9 +73,8 @@ def test_garbage_is_refused(data: bytes) -> None:
 
 
 _PROGRAM = r"""
-#include <stdio.h>
 #include "vislam_pose.h"
-_Static_assert(sizeof(vislam_pose) == 256, "size");
+#include <stdio.h>
 #define FIELD(name) printf("%zu ", offsetof(vislam_pose, name));
 int main(int count, char **path) {
     FIELDS
@@ -114,6 +114,55 @@ def test_the_c_header_reads_what_is_published(tmp_path: Path) -> None:
     assert (int(sequence), int(health), int(stamp)) == (pose.sequence, int(pose.health), pose.t_ns)
     assert float(y) == pose.T_odom_base[1, 3]
     assert float(last) == pytest.approx(pose.pose_covariance[5, 5], rel=1e-6)
+
+
+def _publish_for_ever(name: str, k: int) -> None:
+    publisher = PosePublisher(name, ())
+    for sequence in count(1):
+        now_ns = time.monotonic_ns()
+        at = transform(np.eye(3), np.array([float(k), 0.0, 0.0]))
+        publisher.publish(random_pose(sequence=sequence, t_ns=now_ns, published_ns=now_ns, T_odom_base=at))
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang", "g++"])
+def test_readers_follow_a_writer_that_is_killed_and_started_again(tmp_path: Path, compiler: str) -> None:
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not here")
+    language = ["-x", "c++", "-std=c++17"] if compiler == "g++" else ["-std=c11", "-pedantic"]
+    name, program = f"vislam-test-{uuid.uuid4().hex}", tmp_path / "read_pose"
+    source = HEADER.with_name("read_pose.c")
+    subprocess.run([compiler, *language, "-Wall", "-Wextra", "-Werror", str(source), "-o", str(program)], check=True)
+    shown = subprocess.Popen([str(program), f"/dev/shm/{name}"], stdout=subprocess.PIPE, text=True)
+    assert shown.stdout is not None
+
+    def until(what: str) -> None:
+        assert any(what in line for line in islice(shown.stdout, 60_000)), what  # ten minutes: only ends a hang
+
+    reader: PoseReader | None = None
+    try:
+        until("stop: there is no pose")
+        for k in range(20):
+            writer = get_context("fork").Process(target=_publish_for_ever, args=(name, k))
+            writer.start()
+            try:
+                until(f": {k}.000 0.000 0.000 m")
+                reader = reader or PoseReader(name)
+                pose = reader.latest()
+                while pose is None or pose.T_odom_base[0, 3] != k:  # met in the middle of a write
+                    pose = reader.latest()
+            finally:
+                writer.kill()
+                writer.join()
+            until("ms old")
+            last = reader.latest()
+            assert last is None or last.age_s > 0.1
+    finally:
+        shown.kill()
+        shown.communicate()
+        if reader is not None:
+            reader.close()
+        Path(f"/dev/shm/{name}").unlink(missing_ok=True)
 
 
 def test_the_header_knows_every_health_bit() -> None:

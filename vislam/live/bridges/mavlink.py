@@ -86,7 +86,7 @@ class Mavlink:
                 continue
             try:
                 data, now_ns = self._socket.recv(_DATAGRAM), self._clock_ns()
-            except OSError:  # it is told so that nobody listened to what was sent last
+            except OSError:  # the refusal of what was sent last
                 continue
             for asked_ns in _timesync_requests(data):
                 self._send(self._link.timesync_encode(now_ns, asked_ns))

@@ -7,6 +7,7 @@ controller steers (x forward, y left, z up). Covariances are in the order and ax
 
 from __future__ import annotations
 
+import time
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -80,6 +81,11 @@ class PublishedPose:
     def T_map_base(self) -> Array:
         """The pose [4, 4] in `map`; it moves by what loops correct, at once where that is much: for planning."""
         return self.T_map_odom @ self.T_odom_base
+
+    @property
+    def age_s(self) -> float:
+        """How long ago this was handed out, by the clock of this machine: large when `vislam live` has gone."""
+        return (time.monotonic_ns() - self.published_ns) * 1e-9
 
     def predict(
         self, t_ns: int, accel_sigma_m_s2: float = 1.0, angular_accel_sigma_rad_s2: float = 1.0

@@ -96,10 +96,18 @@ class PoseReader:
 
     def __init__(self, name: str) -> None:
         """Open what `vislam live --live.name NAME` publishes. Raises DataError when it does not run."""
-        self._slot = SlotReader(name)
+        self._name, self._slot = name, SlotReader(name)
 
     def latest(self) -> PublishedPose | None:
-        """Return the newest pose, None before the first."""
+        """Return the newest pose, None before the first.
+
+        A restarted `vislam live` is followed. After one that has gone its last pose comes again: look at `age_s`.
+        """
+        if self._slot.is_replaced:
+            with suppress(DataError):  # it has gone again, or is not ours
+                follower = SlotReader(self._name)
+                self._slot.close()
+                self._slot = follower
         read = self._slot.read()
         return None if read is None else unpack(read[1])
 

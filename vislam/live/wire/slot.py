@@ -81,15 +81,26 @@ class SlotReader:
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
-                owner = os.fstat(descriptor).st_uid
-                if owner not in (os.geteuid(), 0):
-                    raise DataError(f"shared memory {path} is that of user {owner}, who may write anything into it")
+                found = os.fstat(descriptor)
+                if found.st_uid not in (os.geteuid(), 0):
+                    raise DataError(
+                        f"shared memory {path} is that of user {found.st_uid}, who may write anything into it"
+                    )
                 self._memory = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
             finally:
                 os.close(descriptor)
         except (OSError, ValueError) as error:
             raise DataError(f"there is no shared memory {path}: {error}; is `vislam live` running?") from error
         self._tail = len(self._memory) - _TAIL.size
+        self._path, self._found = path, found
+
+    @property
+    def is_replaced(self) -> bool:
+        """Whether another writer has the name now; this memory gets no more values then."""
+        try:
+            return not os.path.samestat(self._path.stat(), self._found)
+        except OSError:
+            return False
 
     @property
     def sequence(self) -> int:

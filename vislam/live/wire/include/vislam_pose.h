@@ -1,18 +1,31 @@
 /* The pose that `vislam live` publishes: in shared memory (/dev/shm/NAME), and as one datagram per inertial sample.
  *
  * Little-endian, 256 bytes, no padding; docs/cart.md explains the fields. Check magic, version, size and crc32, then
- * the health word: a controller must not steer by a pose with VISLAM_INVALID or VISLAM_IMU_MISSING set.
+ * the health word: a controller must not steer by a pose with VISLAM_INVALID or VISLAM_IMU_MISSING set, nor by an old
+ * one: where `vislam live` was killed, the last pose stays. Use vislam_pose_latest, which follows a restarted one, and
+ * look at the age; read_pose.c does.
  */
 #ifndef VISLAM_POSE_H
 #define VISLAM_POSE_H
 
+#if !defined(_POSIX_C_SOURCE) && !defined(_GNU_SOURCE)
+#define _POSIX_C_SOURCE 200809L
+#endif
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
 #include <fcntl.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+#include <time.h>
 #include <unistd.h>
+
+#ifndef CLOCK_MONOTONIC
+#error "include vislam_pose.h first, or define _POSIX_C_SOURCE 200809L"
+#endif
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "poses are little-endian"
+#endif
 
 #define VISLAM_POSE_MAGIC 0x4F505356u /* "VSPO" */
 #define VISLAM_POSE_VERSION 1
@@ -72,6 +85,18 @@ typedef struct vislam_pose_slot {       /* what is mapped from shared memory */
     uint64_t sequence_first;            /* written first */
 } vislam_pose_slot;
 
+#ifdef __cplusplus
+#define VISLAM_ASSERT(fact) static_assert(fact, #fact)
+#else
+#define VISLAM_ASSERT(fact) _Static_assert(fact, #fact)
+#endif
+VISLAM_ASSERT(sizeof(vislam_pose) == 256);
+VISLAM_ASSERT(offsetof(vislam_pose, position_m) == 32);
+VISLAM_ASSERT(offsetof(vislam_pose, pose_covariance) == 96);
+VISLAM_ASSERT(offsetof(vislam_pose, crc32) == 252);
+VISLAM_ASSERT(sizeof(vislam_pose_slot) == 280);
+VISLAM_ASSERT(offsetof(vislam_pose_slot, pose) == 16);
+
 static inline uint32_t vislam_crc32(const void *data, size_t length) {
     const uint8_t *bytes = (const uint8_t *)data;
     uint32_t crc = 0xFFFFFFFFu;
@@ -108,6 +133,44 @@ static inline int vislam_pose_read(const volatile vislam_pose_slot *slot, vislam
     memcpy(out, (const void *)&slot->pose, sizeof *out);
     __sync_synchronize();
     return sequence != 0 && slot->sequence_first == sequence && vislam_pose_is_sound(out);
+}
+
+/* Nanoseconds since a pose was published, by the clock of this machine. */
+static inline int64_t vislam_pose_age_ns(const vislam_pose *pose) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec - pose->stamp_publish_ns;
+}
+
+typedef struct vislam_pose_reader {     /* begin with {.path = "/dev/shm/vislam-pose"}, the rest 0 */
+    const char *path;
+    const vislam_pose_slot *slot;       /* NULL: nothing is mapped */
+    dev_t device;                       /* of what is mapped */
+    ino_t inode;
+} vislam_pose_reader;
+
+/* Let go of the memory; vislam_pose_latest maps it again. */
+static inline void vislam_pose_close(vislam_pose_reader *reader) {
+    if (reader->slot != NULL) munmap((void *)reader->slot, sizeof *reader->slot);
+    reader->slot = NULL;
+}
+
+/* Copy the newest pose, of the writer that has the name now; 0 as vislam_pose_read, or when there is no writer yet.
+ *
+ * One call of stat more than vislam_pose_read. After the writer has gone, its last pose comes again and again. */
+static inline int vislam_pose_latest(vislam_pose_reader *reader, vislam_pose *out) {
+    struct stat found;
+    int is_there = stat(reader->path, &found) == 0;
+    if (is_there && (reader->slot == NULL || found.st_ino != reader->inode || found.st_dev != reader->device)) {
+        const vislam_pose_slot *slot = vislam_pose_open(reader->path);
+        if (slot != NULL) {             /* of a still newer writer, if it came in between: then mapped once more */
+            vislam_pose_close(reader);
+            reader->slot = slot;
+            reader->device = found.st_dev;
+            reader->inode = found.st_ino;
+        }
+    }
+    return reader->slot != NULL && vislam_pose_read(reader->slot, out);
 }
 
 #endif
