@@ -145,8 +145,20 @@ class Bridge:
         return self._child.process.exitcode
 
 
+ON_LOOPBACK = '<NetworkInterface address="127.0.0.1" multicast="true"/>'
+ASKING = "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
+
+
 @needs_dds
-def test_a_ros_reader_gets_the_pose_from_the_process_beside() -> None:
+@pytest.mark.parametrize(
+    "loopback",
+    [
+        f"<General><Interfaces>{ON_LOOPBACK}</Interfaces></General>",
+        f"<General><AllowMulticast>false</AllowMulticast><Interfaces>{ON_LOOPBACK}</Interfaces></General><Discovery>{ASKING}</Discovery>",
+    ],
+    ids=["multicast", "asking"],
+)
+def test_a_ros_reader_gets_the_pose_from_the_process_beside(loopback: str) -> None:
     from cyclonedds.domain import Domain, DomainParticipant
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
@@ -155,7 +167,7 @@ def test_a_ros_reader_gets_the_pose_from_the_process_beside() -> None:
 
     name = f"vislam-test-{uuid.uuid4().hex[:8]}"
     translator = Bridge(LiveConfig(name=name, ros2_domain=_DOMAIN, bridge_rate_hz=1000.0), "ros2")
-    domain = Domain(_DOMAIN, ros2.LOOPBACK)
+    domain = Domain(_DOMAIN, f"<CycloneDDS><Domain>{loopback}</Domain></CycloneDDS>")
     participant = DomainParticipant(_DOMAIN)
     readers = {
         topic: DataReader(participant, Topic(participant, f"rt/{topic}", kind, qos=ros2.QOS), qos=ros2.QOS)
@@ -181,6 +193,59 @@ def test_a_ros_reader_gets_the_pose_from_the_process_beside() -> None:
     assert message.pose.pose.position == expected.pose.pose.position
     np.testing.assert_allclose(message.pose.covariance, expected.pose.covariance, rtol=1e-6)
     assert [link.child_frame_id for link in got["tf"][-1].transforms] == ["odom", "base_link"]
+
+
+@needs_dds
+def test_a_peer_that_is_not_cyclone_is_called_on_loopback_alone() -> None:
+    """Any DDS listens at this address and port for what others announce of themselves (RTPS 2.2, 9.6.1.4)."""
+    from vislam.live.bridges import ros2
+
+    domain = _DOMAIN + 32
+    peer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    peer.bind(("239.255.0.1", 7400 + 250 * domain))
+    group = socket.inet_aton("239.255.0.1") + socket.inet_aton("127.0.0.1")
+    peer.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+    peer.settimeout(600.0)  # only ends a hang
+    before = udp_sockets()
+    wire = ros2.Ros2(domain)
+    try:
+        data, (sender, _) = peer.recvfrom(65536)
+        assert data.startswith(b"RTPS") and sender == "127.0.0.1"
+        opened = udp_sockets() - before
+        assert opened
+        with open("/proc/net/udp") as table:  # bound to which addresses and to which device
+            bound = {row.split()[9]: row.split()[1].split(":")[0] for row in table.readlines()[1:]}
+        assert {bound[inode] for inode, _ in opened} <= {"0100007F", "00000000"}
+        assert {device for _, device in opened} == {b"lo"}
+    finally:
+        wire.close()
+        peer.close()
+
+
+def udp_sockets() -> set[tuple[str, bytes]]:
+    """Return inode and device of every UDP socket of this process."""
+    found = set()
+    for entry in os.listdir("/proc/self/fd"):
+        try:
+            with socket.socket(fileno=os.dup(int(entry))) as held:
+                if (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM):
+                    device = held.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(b"\0")
+                    found.add((str(os.fstat(held.fileno()).st_ino), device))
+        except OSError:
+            continue
+    return found
+
+
+@needs_dds
+def test_a_socket_that_cannot_be_kept_to_loopback_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    from vislam.live.bridges import ros2
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as open_to_all, pytest.MonkeyPatch.context() as patch:
+        open_to_all.bind(("", 0))
+        patch.setattr(socket, "SO_BINDTODEVICE", 9999)
+        ros2._hear_loopback_alone([open_to_all.fileno()])
+        assert f"port {open_to_all.getsockname()[1]} hears other machines" in caplog.text
 
 
 @needs_dds

@@ -6,7 +6,12 @@ Needs cyclonedds. The structs below are those of ROS's message packages, field b
 are those of https://design.ros2.org/articles/topic_and_service_names.html and of rmw_cyclonedds.
 """
 
+import logging
+import os
+import socket
 import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import cyclonedds.idl.annotations as annotate
@@ -24,11 +29,12 @@ from vislam.core.messages import Array as Matrix
 from vislam.hw.health import Health
 from vislam.live.wire.published_pose import PublishedPose
 
+_LOG = logging.getLogger(__name__)
 _NS = 1_000_000_000
-# Peers are asked one by one, as the loopback interface has no multicast.
+# Linux carries multicast on loopback though the interface does not state so: most peers are found by it. Those that are
+# set to do without are asked one by one.
 LOOPBACK = """<CycloneDDS><Domain Id="any">
-  <General><AllowMulticast>false</AllowMulticast>
-    <Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>
+  <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="true"/></Interfaces></General>
   <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
 QOS = Qos(
@@ -72,8 +78,11 @@ class Ros2:
             domain: what ROS_DOMAIN_ID is for the others.
             allow_remote: use the interfaces that CYCLONEDDS_URI or the system names; else the loopback one alone.
         """
+        others = set(_udp_sockets())
         self._domain = None if allow_remote else Domain(domain, LOOPBACK)
         self._participant = DomainParticipant(domain)
+        if not allow_remote:
+            _hear_loopback_alone(set(_udp_sockets()) - others)
         publisher = Publisher(self._participant)
         self._odom = DataWriter(publisher, Topic(self._participant, "rt/odom", Odometry, qos=QOS), qos=QOS)
         self._tf = DataWriter(publisher, Topic(self._participant, "rt/tf", TFMessage, qos=QOS), qos=QOS)
@@ -91,6 +100,24 @@ class Ros2:
     def close(self) -> None:
         """Leave the domain; may be called twice."""
         vars(self).clear()  # an entity leaves when it is let go
+
+
+def _udp_sockets() -> Iterator[int]:
+    """Yield the descriptors of this process that are UDP sockets."""
+    for entry in os.listdir("/proc/self/fd"):
+        with suppress(OSError), socket.socket(fileno=os.dup(int(entry))) as found:  # one that is no socket, or closed
+            if found.type == socket.SOCK_DGRAM and found.family in (socket.AF_INET, socket.AF_INET6):
+                yield int(entry)
+
+
+def _hear_loopback_alone(descriptors: Iterable[int]) -> None:
+    """Bind sockets to the loopback device, as Cyclone binds those it receives by to every address (its issue 2090)."""
+    for descriptor in descriptors:
+        with socket.socket(fileno=os.dup(descriptor)) as bound:
+            try:
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+            except OSError as error:  # Linux before 5.7 lets root alone do so
+                _LOG.warning("ROS 2's port %d hears other machines, too: %s", bound.getsockname()[1], error.strerror)
 
 
 def odometry(pose: PublishedPose, stamp_ns: int) -> Any:
