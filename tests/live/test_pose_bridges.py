@@ -244,7 +244,7 @@ def test_a_socket_that_cannot_be_kept_to_loopback_is_named(caplog: pytest.LogCap
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as open_to_all, pytest.MonkeyPatch.context() as patch:
         open_to_all.bind(("", 0))
         patch.setattr(socket, "SO_BINDTODEVICE", 9999)
-        ros2._hear_loopback_alone([open_to_all.fileno()])
+        ros2.hear_loopback_alone([open_to_all.fileno()])
         assert f"port {open_to_all.getsockname()[1]} hears other machines" in caplog.text
 
 

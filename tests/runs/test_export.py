@@ -26,7 +26,7 @@ from vislam.runs.offline import export_mcap as exporting
 from vislam.runs.offline.export_mcap import export_mcap
 from vislam.runs.session import SessionWriter
 from vislam.trajectory import Trajectory, write_states_csv, write_tum
-from vislam.trajectory.motion import motion_of
+from vislam.trajectory.motion_numbers import motion_of
 
 CAMERA = Camera(640, 480, 458.0, 457.0, 320.0, 240.0)
 RIG = Rig((CAMERA, CAMERA), (se3_exp(np.array([0.1, -0.2, 1.5, 0.01, 0.02, 0.03])), np.eye(4)))

@@ -293,7 +293,7 @@ class FrameEntry:
     reason: str = ""
     localisation: Localisation = Localisation.TRACKING
     submap: int = 0  # of the trajectory
-    motion: Array | None = None  # [30] of the filter, see `trajectory.motion`; None: it has no state
+    motion: Array | None = None  # [30] of the filter, see `trajectory.motion_numbers`; None: it has no state
 
 
 @dataclass(frozen=True, slots=True, eq=False)

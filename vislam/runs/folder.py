@@ -43,7 +43,7 @@ from vislam.runs.session import Session, has_frames
 from vislam.runs.sources import recorded_path
 from vislam.trajectory import Alignment, Trajectory, write_states_csv, write_tum
 from vislam.trajectory.frames import LoggedFrames
-from vislam.trajectory.motion import motion_of
+from vislam.trajectory.motion_numbers import motion_of
 
 _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}

@@ -82,7 +82,7 @@ class Ros2:
         self._domain = None if allow_remote else Domain(domain, LOOPBACK)
         self._participant = DomainParticipant(domain)
         if not allow_remote:
-            _hear_loopback_alone(set(_udp_sockets()) - others)
+            hear_loopback_alone(set(_udp_sockets()) - others)
         publisher = Publisher(self._participant)
         self._odom = DataWriter(publisher, Topic(self._participant, "rt/odom", Odometry, qos=QOS), qos=QOS)
         self._tf = DataWriter(publisher, Topic(self._participant, "rt/tf", TFMessage, qos=QOS), qos=QOS)
@@ -110,8 +110,8 @@ def _udp_sockets() -> Iterator[int]:
                 yield int(entry)
 
 
-def _hear_loopback_alone(descriptors: Iterable[int]) -> None:
-    """Bind sockets to the loopback device, as Cyclone binds those it receives by to every address (its issue 2090)."""
+def hear_loopback_alone(descriptors: Iterable[int]) -> None:
+    """Bind sockets to the loopback device, as Cyclone receives at every address (its issue 2090); warn where refused."""
     for descriptor in descriptors:
         with socket.socket(fileno=os.dup(descriptor)) as bound:
             try:

@@ -27,7 +27,7 @@ from vislam.runs.loaded import KeyframeStates, LoadedRun, load_run
 from vislam.runs.offline.ros_messages import BASE, MAP, ODOM, UNKNOWN_VARIANCE, RosMessages, kept_for_late_joiners
 from vislam.runs.session import Session
 from vislam.trajectory import Trajectory
-from vislam.trajectory.motion import motion_of, motion_parts
+from vislam.trajectory.motion_numbers import motion_of, motion_parts
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

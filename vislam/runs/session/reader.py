@@ -42,7 +42,7 @@ from vislam.runs.session.schema import (
     state_of,
 )
 from vislam.trajectory.frames import LoggedFrames
-from vislam.trajectory.motion import MOTION_NUMBERS
+from vislam.trajectory.motion_numbers import MOTION_NUMBERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -272,8 +272,7 @@ class SessionWriter:
 
     def _write_frames(self) -> None:
         self._replace("frames", [_frame_row(frame) for frame in self._frames])
-        moving = [(frame.t_ns, to_bytes(frame.motion, "<f8")) for frame in self._frames if frame.motion is not None]
-        self._replace("motions", moving)
+        self._replace("motions", [(f.t_ns, to_bytes(f.motion, "<f8")) for f in self._frames if f.motion is not None])
         self._frames = []
 
     def _set_info(self, entries: dict[str, Any]) -> None:
