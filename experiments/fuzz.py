@@ -30,6 +30,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import bombs
 import cv2
 import numpy as np
 
@@ -54,6 +55,7 @@ class Target:
     seeds: list[dict[str, bytes]]
     read: Callable[[Path], object]
     turns: int = 20  # in a round: fewer where a case takes long
+    made: Callable[[np.random.Generator, dict[str, bytes]], dict[str, bytes]] | None = None  # a bomb, of sound files
 
 
 @dataclass
@@ -115,6 +117,11 @@ def case(target: Target, number: int, seed: int, folder: Path) -> int:
     """Write the files of a case; return how many bytes they have."""
     rng = np.random.default_rng([seed, zlib.crc32(target.name.encode()), number])
     files = dict(target.seeds[int(rng.integers(0, len(target.seeds)))])
+    if target.made is not None:
+        files = target.made(rng, files)
+        if rng.random() < 0.7:
+            write(folder, files)
+            return sum(map(len, files.values()))
     changed = sorted(files)[int(rng.integers(0, len(files)))]
     other = target.seeds[int(rng.integers(0, len(target.seeds)))]
     files[changed] = mutated(files[changed], other[sorted(other)[int(rng.integers(0, len(other)))]], rng)
@@ -278,7 +285,32 @@ def small_targets() -> list[Target]:
         Target("map", _maps(), _read_maps),
         Target("vocabulary", _vocabularies(), _read_vocabularies),
         Target("bridge", [{"bytes": _bridge()}], _read_bridge),
+        *bomb_targets(),
         Target("tables", [{"loops.csv": _loops_csv(), "retrieved.csv": _RETRIEVED}], _read_tables),
+    ]
+
+
+def bomb_targets() -> list[Target]:
+    """Return the targets whose files are built to ask for much, and sometimes mutated then."""
+
+    def recording(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        images = [name for name in sound if name.endswith(".png")]
+        return sound | {str(rng.choice(images)): bombs.forged_image(rng, _IMAGE)}
+
+    def calibration(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        return {"c.yaml": bombs.yaml_bomb(rng, sound["c.yaml"])}
+
+    def settings(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        return {name: bombs.toml_bomb(rng, data) for name, data in sound.items()}
+
+    def bag(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        return {"a.bag": bombs.bag_bomb(rng)} if rng.random() < 0.5 else {"a.mcap": bombs.mcap_bomb(rng)}
+
+    return [
+        Target("calibration bomb", _calibrations()[:4], _read_calibrations, made=calibration),
+        Target("settings bomb", _settings(), _read_settings, made=settings),
+        Target("image bomb", [_asl(), _tum(), _kitti()], _survey, made=recording),
+        Target("bag bomb", _bags()[:1], _read_bags, 10, made=bag),
     ]
 
 

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vislam.core.errors import DataError, StorageError, UsageError
+from vislam.core import DataError, UsageError, VislamError
 from vislam.core.geometry import se3_exp, so3_exp, so3_log, transform
 from vislam.core.messages import NavState
 from vislam.hw.health import Health
@@ -284,7 +284,7 @@ def test_a_full_shared_memory_is_named_and_leaves_nothing(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(os, "posix_fallocate", full)
     name = f"vislam-test-{uuid.uuid4().hex}"
-    with pytest.raises(StorageError, match=f"/dev/shm/{name} cannot be made: No space left.*/dev/shm is full"):
+    with pytest.raises(VislamError, match=f"/dev/shm/{name} cannot be made: No space left.*/dev/shm is full"):
         SlotWriter(name, 8)
     assert list(Path("/dev/shm").glob(f"*{name}*")) == []
 
