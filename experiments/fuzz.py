@@ -77,6 +77,10 @@ class Answer(NamedTuple):
     grown_bytes: int  # at most
 
 
+class TooSlow(BaseException):
+    """A case works too long; nothing that a reader catches."""
+
+
 def mutated(data: bytes, other: bytes, rng: np.random.Generator) -> bytes:
     """Return data with one to four changes; `other` is spliced in at times."""
     out = bytearray(data)
@@ -151,7 +155,7 @@ def outcome(target: Target, folder: Path, size: int) -> Answer:
         what, words = "refused", str(error)
         if words != printable(words) or not words:
             what = "UNPRINTABLE"
-    except TimeoutError:
+    except TooSlow:
         what, words = "SLOW", traceback.format_exc(limit=-3)
     except BaseException as error:
         what, words = "TRACEBACK", f"{type(error).__name__} {error}\n" + traceback.format_exc(limit=-4)
@@ -229,7 +233,7 @@ def _work(order: Iterable[tuple[Target, int]], seed: int, scratch: Path, writer:
 
 
 def _too_slow(*_: object) -> None:
-    raise TimeoutError
+    raise TooSlow
 
 
 def _answers(reader: int) -> Iterator[Answer | None]:

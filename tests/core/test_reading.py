@@ -34,7 +34,7 @@ WRONG = (
     "[" * MAX_YAML_BYTES, "{a: " * 50_000, "- " * 50_000, "? " * 50_000, "".join(" " * i + "a:\n" for i in range(300)),
     "a: &a [*a]", "a: &a {<<: *a}", "a: *b", "a: 1" + ":1" * 100_000, "a: " + "9" * 5000, "a: !!int ''",
     "a: !!bool x", "a: !!timestamp x", "a: 2020-13-45", "!!python/object:os.system x", "? {a: b}\n: c", "a: \0",
-    "a: \ud800", "a: [",
+    "a: \ud800", "a: [", "a: 0x" + "f" * 5000, "a: !!int '0b" + "1" * 5000 + "'",
 )  # fmt: skip
 
 

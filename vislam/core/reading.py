@@ -28,7 +28,7 @@ MAX_PIXELS = 2**25  # of an image: 8K video; whatever else a camera, a header or
 _FREE_NODES = 10_000  # of YAML, beside one for each byte: what aliases and merge keys may add
 _MAX_DOTS = 100  # in a line of TOML: work and memory go with the square of a dotted key's parts
 _MAX_DEPTH = 64  # of tables within tables
-_MAX_SCALAR = 2**15  # characters: 1:1:1... is a number to base 60, whose work goes with the square
+_MAX_DIGITS = 1000  # of a number of YAML: work goes with the square of those of 1:1:1..., which is one to base 60
 
 
 class Budget:
@@ -37,7 +37,7 @@ class Budget:
     def __init__(self, path: Path, size_bytes: int) -> None:
         """Begin with all that a file of `size_bytes` justifies."""
         self._path = path
-        self._records, self._bytes = 500_000 + size_bytes // 8, 2**30 + 100 * size_bytes
+        self._records, self._bytes = 200_000 + size_bytes // 16, 2**30 + 100 * size_bytes
 
     def take(self, records: int = 1, unpacked_bytes: int = 0) -> None:
         """Count what was met, however often; raises DataError beyond what is justified."""
@@ -150,7 +150,9 @@ def _check_yaml(events: Iterable[Any], most_nodes: int) -> None:
                 raise ValueError(f"alias *{anchor[:40]} within what it stands for, or of nothing")
             size = sizes[anchor]
         elif kind == "ScalarEvent":
-            size = 1 if len(event.value) <= _MAX_SCALAR else most_nodes + 1
+            size = 1
+            if len(event.value) > _MAX_DIGITS and event.value.lstrip("+-. ")[:1].isdigit():
+                raise ValueError(f"a number of more than {_MAX_DIGITS} digits")
         else:
             continue
         if anchor:
@@ -158,7 +160,7 @@ def _check_yaml(events: Iterable[Any], most_nodes: int) -> None:
         outer, so_far = open_nodes[-1]
         open_nodes[-1] = (outer, so_far + size)
         if so_far + size > most_nodes:
-            raise ValueError("aliases, merge keys or a scalar that ask for far more than any such file holds")
+            raise ValueError("aliases or merge keys that ask for far more than any such file holds")
 
 
 def _check_depth(data: Any) -> None:
