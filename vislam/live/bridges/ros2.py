@@ -111,7 +111,7 @@ def _udp_sockets() -> Iterator[int]:
 
 
 def hear_loopback_alone(descriptors: Iterable[int]) -> None:
-    """Bind sockets to the loopback device, as Cyclone receives at every address (its issue 2090); warn where refused."""
+    """Bind sockets to the loopback device, as Cyclone receives at every address (its issue 2090); warn if refused."""
     for descriptor in descriptors:
         with socket.socket(fileno=os.dup(descriptor)) as bound:
             try:
