@@ -170,8 +170,6 @@ class SerialBridge:
             except PORT_ERRORS:
                 self._counts["close_failures"] += 1
 
-    # ---- the port ---------------------------------------------------------------------------------------------
-
     def _open(self, now: int) -> None:
         """Try to open the port; what keeps it from opening is in `problem`."""
         config = self._config
@@ -250,8 +248,6 @@ class SerialBridge:
             self._lose(*self._diagnosis())
         samples.sort(key=lambda sample: sample.t_ns)
         return samples
-
-    # ---- messages ---------------------------------------------------------------------------------------------
 
     def _taken(self, message: Message, arrival_ns: int) -> list[ImuSample | MagSample]:
         if isinstance(message, Counts | Passed):
