@@ -314,7 +314,7 @@ def bomb_targets() -> list[Target]:
         Target("calibration bomb", _calibrations()[:4], _read_calibrations, made=calibration),
         Target("settings bomb", _settings(), _read_settings, made=settings),
         Target("image bomb", [_asl(), _tum(), _kitti()], _survey, made=recording),
-        Target("bag bomb", _bags()[:1], _read_bags, 10, made=bag),
+        Target("bag bomb", _bags()[:1], _read_bags, made=bag),
     ]
 
 
