@@ -86,6 +86,7 @@ SMALLEST = {
     "benchmarks/window.py": "compare --seconds 4 --seeds 1",
 }
 ELSEWHERE = {  # what runs the others, or what they need that is not here
+    "experiments/bombs.py": "tests/test_fuzz.py",
     "experiments/failures.py": "tests/scripts/test_failures.py",
     "experiments/fuzz.py": "tests/test_fuzz.py",
     "experiments/readme_table.py": "tests/test_readme_table.py",
