@@ -1,9 +1,9 @@
 """Defaults of the visual front end and of initialisation."""
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Share, Whole
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Share, Whole
 from vislam.core.kinds import check_name
 
 _OwnMode = Literal["auto", "mono", "stereo", "rgbd", "planar", "none"]
@@ -51,7 +51,9 @@ class FrontEndConfig:
     max_tracks: Count = 400  # corners; more add little accuracy once the image is covered, and cost time
     min_distance_px: NonNegative = 12.0  # between corners; nearer ones see the same patch
     max_misses: Whole = 2  # frames in a row that a track may fail before it is dropped
-    track_sigma_px: Positive = 1.0  # Lucas-Kanade noise of hand-held video; 0.3 in sharp images
+    track_sigma_px: Annotated[float, Range(1e-6, 2.0**14)] = (
+        1.0  # Lucas-Kanade noise of hand-held video; 0.3 in sharp images
+    )
     # rolling shutter, first to last row; 0 is global, None estimates it while running
     readout_s: NonNegative | None = None
 

@@ -42,7 +42,7 @@ _MOST_OF = {"_px": 2.0**14, "_deg": 360.0, "_s": 5e4, "_m": 1e5, "_hz": 1e5}
 
 Finite = Annotated[float, Range(-_HUGE, _HUGE)]
 NonNegative = Annotated[float, Range(0.0, _HUGE)]
-Positive = Annotated[float, Range(1e-6, _HUGE)]
+Positive = Annotated[float, Range(1e-9, _HUGE)]
 Cell = Annotated[float, Range(1e-3, 1e3)]  # edge of the cells of a map, in metres: memory goes with its third power
 Share = Annotated[float, Range(0.0, 1.0)]
 PositiveShare = Annotated[float, Range(0.0, 1.0, without_low=True)]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from vislam.core.geometry import skew
 from vislam.core.messages import Array, NavState
 
 MOTION_NUMBERS = 30
@@ -19,7 +18,7 @@ def motion_of(state: NavState) -> Array:
     """Return the motion [30] of a state; what was not estimated, or is not finite, is NaN, as all that hangs on it."""
     R, P = state.T_world_body[:3, :3], state.covariance[:9, :9]
     velocity = R.T @ state.velocity_world_m_s
-    J, K = np.zeros((6, 6)), np.hstack([skew(velocity), R.T])
+    J, K = np.zeros((6, 6)), np.hstack([np.cross(velocity, np.eye(3)).T, R.T])
     J[:3, 3:], J[3:, :3] = np.eye(3), R  # states perturb rotation on the body's side
     known = np.r_[0:3, 6:9]
     with np.errstate(invalid="ignore"):

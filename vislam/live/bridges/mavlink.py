@@ -11,7 +11,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
-from select import select
+from select import POLLIN, poll
 from threading import Event, Lock, Thread
 
 import numpy as np
@@ -29,7 +29,7 @@ _UPPER = np.triu_indices(6)
 _SYSTEM = 1  # the vehicle that the autopilot steers
 _HEARTBEAT_NS = 1_000_000_000
 _SEEN, _DOUBTED, _BLIND, _FAILED = 100, 50, 25, -1
-_LOOK_S = 0.1  # after which the end is looked for
+_LOOK_MS = 100  # after which the end is looked for
 _DATAGRAM = 65536
 
 
@@ -81,8 +81,10 @@ class Mavlink:
                 return
 
     def _answer(self) -> None:
+        arrivals = poll()  # `select` fails from the thousandth open file on
+        arrivals.register(self._socket, POLLIN)
         while not self._closed.is_set():
-            if not select([self._socket], [], [], _LOOK_S)[0]:
+            if not arrivals.poll(_LOOK_MS):
                 continue
             try:
                 data, now_ns = self._socket.recv(_DATAGRAM), self._clock_ns()
