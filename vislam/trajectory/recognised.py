@@ -30,7 +30,6 @@ from vislam.trajectory.formats import (
 _OTHERS = {
     b"PK\x03\x04": "a zip archive, as evo saves results; unzip it and give the trajectory in it, if it holds one",
     b"\x1f\x8b": "packed by gzip; unpack it first",
-    b"version https://git-lfs": "a Git LFS pointer, not the file itself; fetch it: git lfs pull",
     b"\x93NUMPY": "an array of NumPy; save it as text: t x y z qx qy qz qw",
     b"\xff\xfe": "UTF-16 or not text; save it as UTF-8",
     b"#ROSBAG": "a bag; give its topic: --topic or --reference-topic",
