@@ -1,6 +1,7 @@
 """Fixtures every test may use."""
 
 import ctypes
+import gc
 import os
 import shutil
 import signal
@@ -25,6 +26,7 @@ TESTS = Path(__file__).resolve().parent
 REPOSITORY = TESTS.parent
 QUICK = {line for line in (TESTS / "quick.txt").read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
 _LIBC = ctypes.CDLL(None)
+_LEFT_OPEN = 16  # by libraries, once
 _M_MMAP_THRESHOLD, _MAPPED_BYTES = -3, 1 << 20
 
 # Compilation makes first examples slow, and a build must not fail by chance: fixed examples, no deadline.
@@ -65,10 +67,14 @@ def painted_once() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="module")
 def trimmed() -> Iterator[None]:
-    """Give back to the system what the tests of a module have freed."""
+    """Give back to the system what the tests of a module have freed; they may not keep files and sockets open."""
+    before = set(os.listdir("/proc/self/fd"))
     yield
+    gc.collect()
     with suppress(AttributeError):
         _LIBC.malloc_trim(0)
+    left = set(os.listdir("/proc/self/fd")) - before
+    assert len(left) <= _LEFT_OPEN, f"the tests of this module leave {len(left)} descriptors open"
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import time
 import uuid
 from itertools import count
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,14 +227,11 @@ def test_a_peer_that_is_not_cyclone_is_called_on_loopback_alone() -> None:
 def udp_sockets() -> set[tuple[str, bytes]]:
     """Return inode and device of every UDP socket of this process."""
     found = set()
-    for entry in os.listdir("/proc/self/fd"):
-        try:
-            with socket.socket(fileno=os.dup(int(entry))) as held:
-                if (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM):
-                    device = held.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(b"\0")
-                    found.add((str(os.fstat(held.fileno()).st_ino), device))
-        except OSError:
-            continue
+    for entry in filter(Path.is_socket, Path("/proc/self/fd").iterdir()):
+        with socket.socket(fileno=os.dup(int(entry.name))) as held:
+            if (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM):
+                device = held.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(b"\0")
+                found.add((str(os.fstat(held.fileno()).st_ino), device))
     return found
 
 

@@ -12,6 +12,7 @@ import socket
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import cyclonedds.idl.annotations as annotate
@@ -104,10 +105,10 @@ class Ros2:
 
 def _udp_sockets() -> Iterator[int]:
     """Yield the descriptors of this process that are UDP sockets."""
-    for entry in os.listdir("/proc/self/fd"):
-        with suppress(OSError), socket.socket(fileno=os.dup(int(entry))) as found:  # one that is no socket, or closed
+    for entry in filter(Path.is_socket, Path("/proc/self/fd").iterdir()):
+        with suppress(OSError), socket.socket(fileno=os.dup(int(entry.name))) as found:  # one that is closed by now
             if found.type == socket.SOCK_DGRAM and found.family in (socket.AF_INET, socket.AF_INET6):
-                yield int(entry)
+                yield int(entry.name)
 
 
 def hear_loopback_alone(descriptors: Iterable[int]) -> None:
