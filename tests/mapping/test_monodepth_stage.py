@@ -115,7 +115,7 @@ def test_late_depth_fills_the_map_like_any_other():
     assert mapper.counters["keyframes_dense"] == 0
     mapper.add_depth(late[3])
     assert mapper.counters["keyframes_dense"] == 1
-    on_table = np.array([[-0.6, y, 0.70] for y in np.linspace(-0.3, 0.3, 13)])  # the voxel layer of the table top
+    on_table = np.array([[-0.6, y, 0.72] for y in np.linspace(-0.3, 0.3, 13)])
     states = mapper.occupancy.state_at(on_table)
     assert (states == Occupancy.OCCUPIED).mean() > 0.5
     assert len(mapper.cloud().points_m) > 1000

@@ -82,7 +82,7 @@ WRONG = {
     "[sensors.'a b']\nkind='height'": "[sensors.a b]: a name of letters",
     "[sensors.a]\nkind='height'\nsigma=1.0": "[sensors.a]: no option 'sigma'; there are: baud, correlated_sigma,",
     "[sensors.a]\nkind='height'\nsigma_m='x'": "[sensors.a]: option sigma_m: Input should be a valid number",
-    "[sensors.a]\nkind='height'\nsigma_m=0.0": "[sensors.a]: sigma_m is 0; allowed is 1e-06 or more and 100000 at most",
+    "[sensors.a]\nkind='height'\nsigma_m=0.0": "[sensors.a]: sigma_m is 0; allowed is 1e-09 or more and 100000 at most",
     "[sensors.a]\nkind='height'\nsigma_m=nan": "[sensors.a]: sigma_m is nan",
     "[sensors.a]\nkind='height'\nlever_m=[1.0,2.0]": "[sensors.a]: option lever_m",
     "[sensors.a]\nkind='height'\noffset_s='now'": "[sensors.a]: option offset_s",
