@@ -1,21 +1,25 @@
 import json
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from needs import missing
 from vislam.core.errors import DataError
 from vislam.mapping import _open3d
 from vislam.mapping._open3d import load_open3d
 from vislam.mapping.cloud.mesh import Mesh
+from vislam.mapping.cloud.surfels import Surfels
+from vislam.mapping.formats.gaussians import write_gaussians
 from vislam.mapping.formats.mesh_files import write_glb, write_obj
 from vislam.mapping.formats.pcd import read_pcd, write_pcd
-from vislam.mapping.formats.ply import read_ply, read_ply_mesh, write_ply
+from vislam.mapping.formats.ply import read_ply, read_ply_mesh, read_ply_rows, write_ply
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.mesh.atlas import TexturedMesh
 from vislam.mapping.octree.octomap_io import read_octree
@@ -50,6 +54,27 @@ def test_open3d_reads_our_clouds(tmp_path):
         np.testing.assert_allclose(np.asarray(cloud.points), points, atol=1e-6)
         np.testing.assert_allclose(np.asarray(cloud.colors) * 255, colors, atol=0.51)
     np.testing.assert_allclose(np.asarray(cloud.normals), points, atol=1e-6)
+
+
+def test_a_gaussian_lies_on_its_surface(tmp_path):
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=(50, 3))
+    normals[0] = (0.0, 0.0, -1.0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points, colors = some_points(50)
+    none = np.zeros(50, np.int64)
+    confidence = np.linspace(0.1, 30.0, 50)
+    write_gaussians(
+        tmp_path / "a.ply",
+        Surfels(points, normals, colors, 0.02 * np.ones(50), confidence, none, none, none, none, none), 0.02,
+    )  # fmt: skip
+    got = read_ply_rows(tmp_path / "a.ply")
+    R = Rotation.from_quat(np.column_stack([got[f"rot_{i}"] for i in (1, 2, 3, 0)])).as_matrix()
+    np.testing.assert_allclose(R[:, :, 2], normals, atol=1e-6)
+    np.testing.assert_allclose(np.exp(got["scale_0"]), 0.01, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(got["scale_2"]), 0.002 / np.sqrt(confidence), rtol=1e-5)
+    for i in range(3):
+        np.testing.assert_allclose((0.28209479 * got[f"f_dc_{i}"] + 0.5) * 255, colors[:, i], atol=1e-3)
 
 
 def test_extra_properties_do_not_hide_the_rest(tmp_path):
@@ -269,7 +294,7 @@ def room(products):
 def test_every_product_is_a_file(tmp_path):
     if load_open3d()[0] is None:
         missing("open3d")
-    products = ("cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels")
+    products = ("cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels", "splats")
     mapper, told = room(products), []
     written = mapper.export(tmp_path, told.append)
     assert tuple(told) == products
@@ -312,7 +337,7 @@ def test_without_open3d_only_meshes_are_missing_and_said(tmp_path, monkeypatch):
     def absent(_):
         raise ImportError("No module named 'open3d'")
 
-    monkeypatch.setattr(_open3d.importlib, "import_module", absent)
+    monkeypatch.setattr(_open3d, "importlib", SimpleNamespace(import_module=absent))
     mapper = room(("cloud", "surfels", "mesh", "glb", "poisson", "drive"))
     assert set(mapper.export(tmp_path)) == {"cloud", "surfels", "drive", "drive_yaml"}
     assert set(mapper.notes) == {"mesh", "glb", "poisson"}

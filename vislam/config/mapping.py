@@ -32,7 +32,9 @@ class DriveConfig:
     slope_window_m: Annotated[float, Range(0.0, 10.0)] = 0.40
 
 
-_OwnProduct = Literal["cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels"]
+_OwnProduct = Literal[
+    "cloud", "pcd", "octomap", "ot", "grid", "drive", "mesh", "glb", "obj", "poisson", "surfels", "splats"
+]
 MapProduct = _OwnProduct | str  # or what a package brings: docs/extend.md
 
 

@@ -20,6 +20,7 @@ from vislam.mapping.cloud.mesh import Mesh, poisson_mesh
 from vislam.mapping.cloud.surfels import Surfels
 from vislam.mapping.drive.drive import DriveGrid
 from vislam.mapping.drive.grid import Grid, write_grid
+from vislam.mapping.formats.gaussians import write_gaussians
 from vislam.mapping.formats.mesh_files import write_glb, write_obj
 from vislam.mapping.formats.pcd import write_pcd
 from vislam.mapping.formats.ply import write_ply
@@ -33,10 +34,11 @@ FILES = {
     "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",
     "grid": "grid.pgm", "drive": "drive.pgm",
     "mesh": "mesh.ply", "glb": "mesh.glb", "obj": "mesh.obj", "poisson": "poisson.ply", "surfels": "surfels.ply",
+    "splats": "splats.ply",
     "labels": VOXELS_NAME,
 }  # fmt: skip
 
-SURFACES = ("mesh", "glb", "obj", "poisson", "surfels")  # what a doubled wall spoils
+SURFACES = ("mesh", "glb", "obj", "poisson", "surfels", "splats")  # what a doubled wall spoils
 NEEDS_UP = ("grid", "drive")  # what means nothing in a map that is not level
 
 
@@ -48,6 +50,7 @@ class NotLevel:
     submaps: str | None
 
 
+_NO_SURFELS = "no surface was seen with dense depth by enough keyframes"
 LEVEL = NotLevel(None, None)  # z is up everywhere
 
 
@@ -124,6 +127,7 @@ def write_products(
         "drive": lambda _: write_grid(folder, source.drive().navigation_grid(), "drive"),
         "glb": lambda path: _write_glb(path, *mesh(), source, config.mesh_atlas_px),
         "surfels": lambda path: _write_surfels(path, surfels(), labels, in_colors),
+        "splats": lambda path: _write_splats(path, surfels(), config.surfel_m),
         "poisson": lambda path: _write_mesh(path, *poisson_mesh(surfels(), config.poisson_depth)),
     }
     if labels is not None:
@@ -194,7 +198,7 @@ def _write_octree(path: Path, content: bytes) -> None:
 def _write_surfels(path: Path, surfels: Surfels, layer: LabelLayer | None, in_colors: bool) -> str | None:
     """Write surfels as a PLY; return the reason if there are none."""
     if len(surfels) == 0:
-        return "no surface was seen with dense depth by enough keyframes"
+        return _NO_SURFELS
     normals = dict(zip(("nx", "ny", "nz"), surfels.normals.T, strict=True))
     extra: dict[str, NDArray[Any]] = {**normals, "radius": surfels.radius_m, "confidence": surfels.confidence}
     colors = surfels.colors
@@ -202,6 +206,14 @@ def _write_surfels(path: Path, surfels: Surfels, layer: LabelLayer | None, in_co
         extra |= {"label": surfels.labels, "votes": surfels.label_votes, "total": surfels.label_total}
         colors = layer.colors_of(surfels.labels) if in_colors else colors
     write_ply(path, surfels.points_m, colors, extra=extra)
+    return None
+
+
+def _write_splats(path: Path, surfels: Surfels, spacing_m: float) -> str | None:
+    """Write surfels as Gaussians; return the reason if there are none."""
+    if len(surfels) == 0:
+        return _NO_SURFELS
+    write_gaussians(path, surfels, spacing_m)
     return None
 
 

@@ -100,7 +100,7 @@ def _observed(index: int, seen: Observations, rig: Rig, config: FrontEndConfig) 
     keyframe = np.full(n, index, dtype=np.int64)
     row = np.clip(seen.pixels_px[:, 1] / max(camera.height - 1.0, 1.0), 0.0, 1.0) - 0.5
     ids = seen.track_ids.astype(np.int64)
-    return _Observed(keyframe, ids, xy, _sigma_per_px(camera, xy), rho, sigma_rho, row, by_focal)
+    return _Observed(keyframe, ids, xy, angle_per_px(camera, xy), rho, sigma_rho, row, by_focal)
 
 
 def _calibrated(seen: Observations, rig: Rig, config: FrontEndConfig) -> tuple[Array, Array, Array]:
@@ -115,7 +115,7 @@ def _calibrated(seen: Observations, rig: Rig, config: FrontEndConfig) -> tuple[A
     return xy, rho, np.where(np.isfinite(rho), config.depth_sigma_rho, np.nan)
 
 
-def _sigma_per_px(camera: Camera, xy: Array) -> Array:
+def angle_per_px(camera: Camera, xy: Array) -> Array:
     """Return the sigma [N] of normalised coordinates for one pixel of noise, the geometric mean of both directions."""
     rays = np.column_stack([np.nan_to_num(xy), np.ones(len(xy))])
     J = camera.project_jacobian(rays)[:, :, :2]
@@ -136,7 +136,7 @@ def stereo_inverse_depth(rig: Rig, xy: Array, right_px: Array, sigma_px: float) 
     length2 = np.einsum("ni,ni->n", b, b)
     with np.errstate(divide="ignore", invalid="ignore"):
         rho = -np.einsum("ni,ni->n", a, b) / length2
-        noise = sigma_px * _sigma_per_px(rig.cameras[1], seen) * np.abs(turned[:, 2])
+        noise = sigma_px * angle_per_px(rig.cameras[1], seen) * np.abs(turned[:, 2])
         sigma = noise / np.sqrt(length2)
     good = np.isfinite(rho) & np.isfinite(sigma)
     return np.where(good, rho, np.nan), np.where(good, sigma, np.nan)
@@ -174,8 +174,8 @@ def triangulate(tracks: Tracks, keep: Mask, T_map_cam: Array, sigma_px: float) -
     information: Array = np.zeros((tracks.points, 3, 3))
     for _ in range(_PASSES):
         A = across / (sigma * distance)[:, None, None] ** 2 + along * weight_along[:, None, None]
-        information = _summed(A.reshape(-1, 9), p, tracks.points).reshape(-1, 3, 3)
-        right = _summed(np.einsum("nij,nj->ni", A, target), p, tracks.points)
+        information = summed(A.reshape(-1, 9), p, tracks.points).reshape(-1, 3, 3)
+        right = summed(np.einsum("nij,nj->ni", A, target), p, tracks.points)
         floor = _UNKNOWN_INFORMATION + 1e-12 * np.trace(information, axis1=1, axis2=2)
         regular = information + floor[:, None, None] * np.eye(3)
         points = np.asarray(np.linalg.solve(regular, right[:, :, None])[:, :, 0])
@@ -188,7 +188,7 @@ def triangulate(tracks: Tracks, keep: Mask, T_map_cam: Array, sigma_px: float) -
     return Triangulation(points, np.where(mean_distance > 0.0, relative, np.inf))
 
 
-def _summed(rows: Array, index: Ints, count: int) -> Array:
+def summed(rows: Array, index: Ints, count: int) -> Array:
     """Return the sums [count, C] of rows [N, C] with the same index."""
     return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
 

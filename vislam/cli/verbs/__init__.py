@@ -64,8 +64,8 @@ _VERBS = {
     ),
     "report": Verb("write report.html of a run again", "vislam report runs/desk"),
     "export": Verb(
-        "write the results of a run as MCAP, for ROS 2, Foxglove and rosbags",
-        "vislam export runs/desk --mcap desk.mcap",
+        "write the results of a run for ROS 2, Foxglove, COLMAP, nerfstudio and splats",
+        "vislam export runs/desk --colmap desk",
     ),
     "completion": Verb("print what makes bash or zsh complete all this", "vislam completion bash >> ~/.bashrc", 0),
 }

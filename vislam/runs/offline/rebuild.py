@@ -67,7 +67,7 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
         if rig.is_blind:
             raise DataError(f"{run} was run without a camera: there is nothing to make a map of")
         level = stored_level(info)
-        placed = _poses(session, run, poses, level.T_level_map)
+        placed = keyframe_poses(session, run, poses, level.T_level_map)
         # depth from one camera was made of frames between keyframes: what the session keeps of it is all there is
         one_camera = ran.map.mono_depth.enabled and not knows_scale(mode_for(ran.frontend, rig))
         config = replace(config, mono_depth=ran.map.mono_depth) if one_camera else config
@@ -136,7 +136,7 @@ def _same_extraction(ran: MapConfig, config: MapConfig, rig: Rig) -> bool:
     return ScanExtractor(ran, rig).view.unit_m == ScanExtractor(config, rig).view.unit_m
 
 
-def _poses(session: Session, run: Path, poses: str, T_level_map: Array) -> dict[int, Array]:
+def keyframe_poses(session: Session, run: Path, poses: str, T_level_map: Array) -> dict[int, Array]:
     """Return T_map_body of the keyframes by id, in order; those before and after the trajectory are left out.
 
     Session and causal trajectories are in the axes of the first image where the run had no gravity: they are turned.
