@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import threading
+import time
 import uuid
 from dataclasses import fields, replace
 from pathlib import Path
@@ -21,15 +23,18 @@ from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
 from vislam.live.status import status_line
 from vislam.live.virtual.cart import VirtualCart
-from vislam.live.virtual.imu import _truth
+from vislam.live.virtual.imu import _truth, open_board, run_board
 from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
 from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
 from vislam.live.virtual.place import course
 from vislam.live.virtual.virtual_readings import VirtualReadings
+from vislam.live.wire.published_pose import PublishedPose
+from vislam.live.wire.publisher import PoseListener
 from vislam.live.wire.slot import SlotWriter
 from vislam.runs.folder import prepare
 from vislam.runs.session import Session
 from vislam.sensors import load_sensor_setup
+from vislam.trajectory import Trajectory, associate, read_tum
 
 
 def test_its_further_sensors_are_drawn_on_its_motion(tmp_path: Path) -> None:
@@ -167,6 +172,7 @@ def test_the_virtual_cart_tells_its_wheels_and_its_camera() -> None:
         ("virtual-cart,colour=red", "no option 'colour'"),
         ("virtual-cart,camera_hz", "write virtual-cart,option=value"),
         ("virtual-cart,imu_out=5", "no list of outages"),
+        ("virtual-cart,imu_fault=frozen", "imu_fault=frozen is one of a serial bridge; write virtual-cart,bridge"),
         ("gy85+webcam", "needs its calibration"),
         ("replay:sim:nowhere", "no simulated world"),
     ],
@@ -285,3 +291,78 @@ def test_a_whole_run_of_the_virtual_cart(tmp_path: Path) -> None:
     assert (out / "trajectory_truth.tum").is_file()
     assert not list(Path("/dev/shm").glob(f"*vislam-virtual-{os.getpid()}*"))
     assert not list(Path("/dev/shm").glob(f"*{name}*"))
+
+
+@pytest.mark.slow
+def test_a_ride_through_the_serial_bridge_and_its_unplugged_port(tmp_path: Path) -> None:
+    """Protocol, bridge, filter, graph and published pose against the true motion."""
+    out, at = tmp_path / "run", f"unix:{tmp_path}/pose"
+    prepare(out, overwrite=False)
+    name = f"vislam-test-bridge-{os.getpid()}"
+    base = load(None, {"view.enabled": False, "map.enabled": False, "live.name": name, "live.send_to": (at,)})
+    asked = "virtual-cart,bridge,camera_hz=4,image_width_px=160,imu_out=5.5:6.2"
+    source, config = open_live(asked, base, SensorsConfig())
+    listener, poses, ended = PoseListener(at), list[PublishedPose](), threading.Event()
+
+    def hear() -> None:
+        while (heard := listener.next(0.5)) is not None or not ended.is_set():
+            poses.extend([] if heard is None else [heard])
+
+    def until_it_sees_again(run: LiveRun) -> None:
+        path = source.true_path()
+        if path and path[-1].t_s > 7.0 and all(map(is_valid, poses[-200:])):
+            run.stop()
+
+    ear = threading.Thread(target=hear)
+    ear.start()
+    try:
+        metrics = LiveRun(source, config, out, asked, ["vislam", "live"]).execute(until_it_sees_again, 60.0)
+    finally:
+        ended.set()
+        ear.join()
+        listener.close()
+    valid = {pose.t_ns: pose for pose in poses if is_valid(pose)}
+    estimate = Trajectory(np.array([*valid]), np.array([pose.T_odom_base for pose in valid.values()]))
+    pairs = associate(estimate, read_tum(out / "trajectory_truth.tum"))
+    pairs = pairs.aligned(pairs.reference[0] @ np.linalg.inv(pairs.estimate[0]))
+    sigma_m = np.sqrt([np.trace(valid[t_ns].pose_covariance[:3, :3]) for t_ns in pairs.t_ns.tolist()])
+    assert (pairs.position_errors_m() < 0.05 + 3.0 * sigma_m).all()
+    assert np.ptp(pairs.reference[:, 0, 3]) > 0.5, "it drove"
+    counts = metrics["live"]["counters"]
+    assert len(poses) + counts["datagrams_refused"] == counts["published"]
+    assert counts["sensor_port_lost"] == 1 and counts["sensor_opened"] == 2
+    assert metrics["counters"]["imu"]["gaps"] >= 1
+    assert counts.get("sensor_bad_frames", 0) == 0
+    assert not list(Path(tempfile.gettempdir()).glob(f"vislam-virtual-{os.getpid()}-*"))
+
+
+def test_a_chip_behind_its_bridge_may_freeze(tmp_path: Path) -> None:
+    name, epoch, port, stop = f"vislam-test-{uuid.uuid4().hex}", Epoch(), tmp_path / "tty", threading.Event()
+
+    class Running:
+        stopped = property(lambda self: stop.is_set())
+
+        def ready(self) -> bool:
+            return True
+
+    drive = Drive(name, 0.0, 0.0, 0.0)
+    told = (Running(), port, name, epoch, 9.81, 0, ((0.0, 600.0),), "frozen")
+    board = threading.Thread(target=run_board, args=told)
+    board.start()
+    try:
+        bridge = open_board(port)
+        seen, end = Health(0), time.monotonic() + 600.0
+        while Health.GYRO_FAULT not in seen:
+            assert time.monotonic() < end, bridge.counters()
+            bridge.read(0.05)
+            seen |= bridge.health()
+        bridge.close()
+    finally:
+        stop.set()
+        board.join()
+        drive.close()
+    assert not port.is_symlink()
+
+
+def is_valid(pose: PublishedPose) -> bool:
+    return Health.LEVELLED in pose.health and Health.INVALID not in pose.health

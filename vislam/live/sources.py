@@ -99,10 +99,17 @@ def _place_options(text: str) -> PlaceOptions:
     values: dict[str, object] = {}
     for part in filter(None, text.split(",")):
         name, equals, value = part.partition("=")
-        if not equals:
+        if part == "bridge":
+            value = "true"
+        elif not equals:
             raise UsageError(f"'{part}' is no option of the virtual cart; write virtual-cart,option=value")
         values[name] = _outages(value) if name.endswith("_out") else value
-    return validated(PlaceOptions, values, "virtual-cart")
+    options = validated(PlaceOptions, values, "virtual-cart")
+    if options.imu_fault != "unplugged" and not options.bridge:
+        raise UsageError(
+            f"imu_fault={options.imu_fault} is one of a serial bridge; write virtual-cart,bridge,imu_fault=..."
+        )
+    return options
 
 
 def _outages(text: str) -> tuple[tuple[float, float], ...]:

@@ -32,7 +32,7 @@ class LiveOptions:
     out: Path
     """Folder to make for everything that the run leaves"""
     source: str = "virtual-cart"
-    """virtual-cart[,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, board+webcam,
+    """virtual-cart[,bridge][,option=value], replay:SOURCE, or IMU and camera: gy85+webcam, board+webcam,
     serial:PORT+webcam; in place of webcam also picam, realsense[,depth], oak[,depth], none (no camera);
     realsense[,depth] and oak[,depth] alone: with the IMU inside that camera"""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)

@@ -1,7 +1,8 @@
 """Boards without hardware: virtual chips under the real smbus2, byte for byte, driven by a motion that is known."""
 
 from vislam.hw.emulator.bmi270 import VirtualBmi270
-from vislam.hw.emulator.board import emulated_gy85
+from vislam.hw.emulator.board import emulated_gy85, gy85_errors
+from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults
 from vislam.hw.emulator.bus import EmulatedBus, emulated_bus
 from vislam.hw.emulator.chips import VirtualAdxl345, VirtualItg3205
 from vislam.hw.emulator.fifo_board import emulated_board
@@ -14,8 +15,10 @@ from vislam.hw.emulator.sensing import SensorError, Truth
 from vislam.hw.emulator.stepped_clock import SteppedClock
 
 __all__ = [
+    "BridgeEmulator",
     "EmulatedBus",
     "FifoChip",
+    "LineFaults",
     "SensorError",
     "SteppedClock",
     "Truth",
@@ -32,4 +35,5 @@ __all__ = [
     "emulated_board",
     "emulated_bus",
     "emulated_gy85",
+    "gy85_errors",
 ]

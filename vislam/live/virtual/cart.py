@@ -15,12 +15,13 @@ import numpy as np
 from vislam.config import USUAL_SLIP_M_S, Config, Gy85Config
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.hw.source import InertialSource
 from vislam.imu import ImuNoise
 from vislam.live.epoch import Epoch
 from vislam.live.frames import FrameSource, NoCamera
 from vislam.live.processes.child import Life
 from vislam.live.reading_source import ReadingSource, refuse_unread
-from vislam.live.virtual.imu import VirtualGy85
+from vislam.live.virtual.imu import VirtualGy85, open_board, run_board
 from vislam.live.virtual.motion import Drive, Segment, locate
 from vislam.live.virtual.pilot import CommandReader, PathFollower
 from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, course, virtual_rig
@@ -35,6 +36,7 @@ _REST_S = 4.0  # before it drives: gravity and gyro bias are found
 _STEP_S = 0.01
 _TRUTH_STEP_S = 0.01
 _COLUMNS = 8
+_BRIDGE_HZ = 400.0  # of the sketch
 _FRAMES_MISSED = 4  # in a row: then vision counts as lost, however slow the camera is
 # the data sheets' noise, with what quantisation to 3.9 mg and 0.07 deg/s adds
 NOISE = ImuNoise(5.4e-4, 7.0e-3, 3.0e-5, 4.0e-4, 200.0, gyroscope_scale_sigma=0.0, accelerometer_scale_sigma=0.0)
@@ -48,7 +50,7 @@ class VirtualCart:
         self.name = "virtual cart"
         self.rig = virtual_rig(options)
         self.is_mag_calibrated = True
-        self.imu_noise: ImuNoise | None = NOISE
+        self.imu_noise: ImuNoise | None = replace(NOISE, rate_hz=_BRIDGE_HZ) if options.bridge else NOISE
         self.frame_count = 0
         self.problems: dict[str, int] = {}
         self.duration_s: float | None = None
@@ -57,6 +59,7 @@ class VirtualCart:
         self._epoch = Epoch()
         self._shared = f"vislam-virtual-{os.getpid()}-{id(self):x}"
         self._truth = Path(tempfile.gettempdir()) / f"{self._shared}.truth"
+        self._port = self._truth.with_suffix(".tty")
 
     def settings(self, config: Config) -> Config:
         """Return the settings with what this cart knows of itself: wheels, and how high its one camera is."""
@@ -79,8 +82,10 @@ class VirtualCart:
     def check(self) -> None:
         """Do nothing: its sensors are simulated."""
 
-    def inertial(self) -> Callable[[], VirtualGy85]:
-        """Return what opens its GY-85."""
+    def inertial(self) -> Callable[[], InertialSource]:
+        """Return what opens its GY-85, or the port that this is behind."""
+        if self.options.bridge:
+            return partial(open_board, self._port)
         config = replace(Gy85Config(), bus="/dev/i2c-virtual", rate_hz=NOISE.rate_hz)
         return partial(
             VirtualGy85, f"{self._shared}-cart", self._epoch, config, self.options.seed, self._gravity_m_s2,
@@ -109,6 +114,11 @@ class VirtualCart:
             found["camera"] = partial(
                 run_camera, name=f"{self._shared}-camera", cart=names[0], epoch=self._epoch, options=self.options
             )
+        if self.options.bridge:
+            found["board"] = partial(
+                run_board, port=self._port, cart=names[0], epoch=self._epoch, gravity_m_s2=self._gravity_m_s2,
+                seed=self.options.seed, outages=self.options.imu_out, fault=self.options.imu_fault,
+            )  # fmt: skip
         return found
 
     def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
@@ -131,6 +141,7 @@ class VirtualCart:
     def close(self) -> None:
         """Remove what its processes wrote and shared; may be called twice."""
         self._truth.unlink(missing_ok=True)
+        self._port.unlink(missing_ok=True)
         for part in ("cart", "camera"):
             remove(f"{self._shared}-{part}")
 

@@ -29,7 +29,10 @@ class PlaceOptions:
     laps: Annotated[int, Field(ge=0, le=1000)] = 2  # of 26 m; 0: it stands
     steered: bool = False  # by who writes commands, see experiments/follow_path.py
     seed: int = 0
-    imu_out: tuple[tuple[float, float], ...] = ()  # s since the beginning: unplugged from, to
+    bridge: bool = False  # its IMU is a board on a serial port, else on I2C
+    # what happens in `imu_out`; all but the first with `bridge` alone
+    imu_fault: Literal["unplugged", "silent", "garbage", "no_gyro", "no_accel", "frozen"] = "unplugged"
+    imu_out: tuple[tuple[float, float], ...] = ()  # s since the beginning: from, to
     camera_out: tuple[tuple[float, float], ...] = ()
 
 
