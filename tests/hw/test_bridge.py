@@ -3,6 +3,7 @@
 import errno
 import math
 import os
+import resource
 import sys
 import termios
 import threading
@@ -399,6 +400,21 @@ def test_a_board_may_go_away_while_it_is_opened(
     assert bridge.counters()["open_failures"] >= 1
     collect(bridge, lambda found: len(imu(found)) > 10)
     bridge.close()
+
+
+def test_it_is_read_where_a_thousand_files_are_open(config: SerialConfig) -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(before[0], min(4096, before[1])), before[1]))
+    held = [os.open(os.devnull, os.O_RDONLY) for _ in range(1100)]  # whatever is opened now comes after
+    try:
+        with BridgeEmulator(Path(config.port), at_rest):
+            bridge = SerialBridge(config)
+            collect(bridge, lambda found: len(imu(found)) > 10)
+            bridge.close()
+    finally:
+        for descriptor in held:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
 def test_one_port_has_one_reader(config: SerialConfig, board: BridgeEmulator) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,11 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Array
+from vislam.hw.descriptor import received
 
 KINDS = ("anglvel", "accel")  # rad/s and m/s^2, by the ABI
 _TYPE = re.compile(r"(be|le):([su])(\d+)/(\d+)(?:X(\d+))?>>(\d+)")
 _AXES = "xyz"
-_READ_BYTES = 1 << 16
 _MOST_BYTES = {8, 16, 32, 64}  # of storage, in bits
 
 
@@ -81,7 +80,7 @@ class IioDevice:
 
         Raises HardwareError: it has no buffer, may not be written, or does not start.
         """
-        self._folder, self._node = folder, node
+        self._folder = folder
         self.name = _text(folder / "name") or folder.name
         self.kinds = kinds_of(folder)
         scan = _scan_folder(folder)
@@ -105,22 +104,10 @@ class IioDevice:
 
     def read(self, timeout_s: float) -> Scans:
         """Return the scans that are there, waiting for the first; raises OSError where the device went away."""
-        ready, _, _ = select.select([self._fd], [], [], timeout_s)
-        data = self._left
-        if ready:
-            data += self._received()
+        data = self._left + received(self._fd, timeout_s)
         whole = len(data) // self._layout.itemsize * self._layout.itemsize
         self._left = data[whole:]
         return self._scans(np.frombuffer(data[:whole], dtype=self._layout))
-
-    def _received(self) -> bytes:
-        try:
-            got = os.read(self._fd, _READ_BYTES)
-        except BlockingIOError:  # another reader was faster
-            return b""
-        if not got:
-            raise OSError(f"{self._node} ended")
-        return got
 
     def close(self) -> None:
         """Stop the buffer; may be called twice."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import select
 import threading
 import time
 from collections import deque
@@ -15,6 +14,7 @@ from vislam.config import SerialConfig
 from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
 from vislam.hw.bridge.bridge import PORT_ERRORS, load_pyserial, why_not_open
+from vislam.hw.descriptor import received
 from vislam.hw.talks import talk_of
 from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.toml import SensorPort
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     import serial
 
 _NS = 1_000_000_000
-_READ_BYTES = 4096
 _GAP_S = 0.05  # without a byte for so long, a burst is over
 _REOPEN_S = 0.5  # between attempts to open a port that is not there
 _SILENT_NS = 5 * _NS  # without a byte for this long, the port is opened again
@@ -118,8 +117,7 @@ class ReadingPort:
         self._talk.begin()
         heard_ns = time.monotonic_ns()
         while not self._stop.is_set():
-            ready, _, _ = select.select([port.fileno()], [], [], _GAP_S)
-            data = port.read(_READ_BYTES) if ready else b""
+            data = received(port.fileno(), _GAP_S)
             now_ns = time.monotonic_ns()
             self._waiting.extend(self._talk.feed(data, now_ns) if data else self._talk.end_burst())
             if data:

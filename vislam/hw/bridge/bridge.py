@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import select
 import termios
 import time
 from collections import Counter
@@ -32,6 +31,7 @@ from vislam.hw.bridge.protocol import (
     Spent,
     Status,
 )
+from vislam.hw.descriptor import received
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 
@@ -45,7 +45,6 @@ _STUCK_S = 0.25  # counts of a chip that do not change for so long: even at rest
 _NS = 1_000_000_000
 # pyserial raises all of them at a device that goes away; its own SerialException is an OSError
 PORT_ERRORS = (OSError, ValueError, TypeError, termios.error)
-_READ_BYTES = 4096
 _GLANCE_S = 0.05  # while the first sample is waited for, so soon a port that cannot be opened is reported
 _NOMINAL_HZ = 400.0  # until the device states it
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
@@ -229,8 +228,7 @@ class SerialBridge:
         """Return the samples in what the port has, waiting for the first byte; an unplugged port is closed."""
         config = self._config
         try:
-            ready, _, _ = select.select([port.fileno()], [], [], timeout_s)
-            data = port.read(_READ_BYTES) if ready else b""
+            data = received(port.fileno(), timeout_s)
         except PORT_ERRORS as error:
             self._lose("port_lost", f"{config.port} went away: {error}; plug it in again")
             return []

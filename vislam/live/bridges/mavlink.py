@@ -11,7 +11,6 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
-from select import POLLIN, poll
 from threading import Event, Lock, Thread
 
 import numpy as np
@@ -19,6 +18,7 @@ from pymavlink.dialects.v20 import common
 
 from vislam.core.geometry import quaternion_wxyz
 from vislam.core.messages import Array
+from vislam.hw.descriptor import is_readable
 from vislam.hw.health import Health
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import send_address
@@ -29,7 +29,7 @@ _UPPER = np.triu_indices(6)
 _SYSTEM = 1  # the vehicle that the autopilot steers
 _HEARTBEAT_NS = 1_000_000_000
 _SEEN, _DOUBTED, _BLIND, _FAILED = 100, 50, 25, -1
-_LOOK_MS = 100  # after which the end is looked for
+_LOOK_S = 0.1  # after which the end is looked for
 _DATAGRAM = 65536
 
 
@@ -81,10 +81,8 @@ class Mavlink:
                 return
 
     def _answer(self) -> None:
-        arrivals = poll()  # `select` fails from the thousandth open file on
-        arrivals.register(self._socket, POLLIN)
         while not self._closed.is_set():
-            if not arrivals.poll(_LOOK_MS):
+            if not is_readable(self._socket.fileno(), _LOOK_S):
                 continue
             try:
                 data, now_ns = self._socket.recv(_DATAGRAM), self._clock_ns()
