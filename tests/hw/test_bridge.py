@@ -18,7 +18,7 @@ import pytest
 from vislam.config import BridgeClockConfig, SensorCalibration, SerialConfig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import ImuSample, MagSample
-from vislam.hw.bridge import protocol
+from vislam.hw.bridge import frame_gaps, protocol
 from vislam.hw.bridge.behind import Behind
 from vislam.hw.bridge.bridge import SerialBridge, why_not_open
 from vislam.hw.bridge.frame_gaps import FrameGaps
@@ -257,6 +257,27 @@ def test_a_host_that_was_busy_stamps_as_if_it_had_not_been(config: SerialConfig,
     if not lost:  # the kernel keeps a third of a second
         assert intervals.max() < 1.1 * PERIOD_NS
     assert np.median(intervals) == pytest.approx(PERIOD_NS, rel=0.02)
+
+
+def test_what_lay_in_the_port_for_long_bends_no_stamp_and_is_counted(
+    config: SerialConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As at the begin of a live run, whose other processes take longer to start."""
+    monkeypatch.setattr(frame_gaps, "_STALE_NS", 500_000_000)
+    config = replace(config, start_s=2.0)
+    with BridgeEmulator(Path(config.port), at_rest, drift=0.01):
+        bridge = SerialBridge(config)
+        before = imu(collect(bridge, lambda found: len(imu(found)) > 10))
+        time.sleep(2.5)  # a terminal keeps 1.6 s
+        woken_ns = time.monotonic_ns()
+        after = imu(collect(bridge, lambda found: len(imu(found)) > 300))
+        lost, opened = bridge.counters()["frames_lost"], bridge.counters()["opened"]
+        bridge.close()
+    assert opened == 1, "that would restart an Arduino"
+    assert after[0].t_ns > woken_ns - 100_000_000, "the terminal's oldest is 2.5 s old"
+    missing = (after[0].t_ns - before[-1].t_ns) / PERIOD_NS
+    assert lost == pytest.approx(missing, rel=0.25)
+    assert np.median(np.diff([sample.t_ns for sample in after])) == pytest.approx(PERIOD_NS, rel=0.02)
 
 
 def test_a_port_that_is_not_there_is_named_at_once(config: SerialConfig) -> None:

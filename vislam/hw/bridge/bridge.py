@@ -229,17 +229,21 @@ class SerialBridge:
         config = self._config
         try:
             data = received(port.fileno(), timeout_s)
+            is_stale = bool(data) and self._gaps.are_stale(time.monotonic_ns(), self._clock.seen_ns)
+            if is_stale:  # as arrivals they would bend the clock's line
+                port.reset_input_buffer()
+                self._decoder.reset()
+                self._clock.restart()
+                data = b""
         except PORT_ERRORS as error:
             self._lose("port_lost", f"{config.port} went away: {error}; plug it in again")
             return []
         arrival_ns = time.monotonic_ns()
         bad = self._decoder.bad
-        samples: list[ImuSample | MagSample] = []
-        for message in self._decoder.feed(data):
-            samples += self._taken(message, arrival_ns)
+        samples = [one for message in self._decoder.feed(data) for one in self._taken(message, arrival_ns)]
         if self._decoder.bad > bad:
             self._events |= Health.BUS_FAULT
-        if samples:
+        if samples or is_stale:
             self._patience_ns = arrival_ns + round(config.start_s * _NS)
             self.problem = ""
         elif arrival_ns >= self._patience_ns:

@@ -45,6 +45,11 @@ class DeviceClock:
         self._suspect: tuple[int, int] | None = None  # device us and arrival ns of a stamp that is off the line
         self._begin()
 
+    @property
+    def seen_ns(self) -> int:
+        """How much of the device's time the line is laid under, 20 s at most."""
+        return 0 if self._last is None else self._last.device_ns - self._lowest[0].device_ns
+
     def restart(self) -> None:
         """Begin a new line: the device was restarted or plugged in again."""
         if self._last is not None:
