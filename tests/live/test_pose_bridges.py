@@ -284,6 +284,75 @@ def test_ros_hears_the_health_word_of_every_pose() -> None:
         wire.close()
 
 
+@needs_dds
+def test_who_comes_later_finds_the_node_and_where_its_sensors_are() -> None:
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
+    from cyclonedds.core import Policy
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from vislam.live.bridges import ros2
+
+    T_body_cam = transform(_TURN, np.array([0.1, 0.0, 0.2]))
+    sensors = translator.sensor_frames(LiveConfig(base_offset_m=(0.0, 0.0, -0.3)), (T_body_cam,))
+    wire = ros2.Ros2(_DOMAIN + 33, sensors)
+    try:
+        other = DomainParticipant(_DOMAIN + 33)
+        static = DataReader(other, Topic(other, "rt/tf_static", ros2.TFMessage, qos=ros2.KEPT), qos=ros2.KEPT)
+        kind = ros2.ParticipantEntitiesInfo
+        nodes = DataReader(other, Topic(other, "ros_discovery_info", kind, qos=ros2.KEPT), qos=ros2.KEPT)
+        links, told = (reader.take_one(timeout=600 * 10**9) for reader in (static, nodes))
+        people = {one.key.bytes: one.qos for one in BuiltinDataReader(other, BuiltinTopicDcpsParticipant).take(N=10)}
+    finally:
+        wire.close()
+    frames = [(link.header.frame_id, link.child_frame_id) for link in links.transforms]
+    assert frames == [("base_link", "imu_link"), ("base_link", "cam0_optical")]
+    where, q = links.transforms[1].transform.translation, links.transforms[1].transform.rotation
+    np.testing.assert_allclose([where.x, where.y, where.z, q.z, q.w], [0.1, 0.0, 0.5, _HALF, _HALF], atol=1e-12)
+    assert people[bytes(told.gid.data[:16])][Policy.Userdata].data == b"enclave=/;"
+    (node,) = told.node_entities_info_seq
+    assert (node.node_namespace, node.node_name, len(node.writer_gid_seq)) == ("/", "vislam", 5)
+
+
+@needs_dds
+def test_messages_are_those_of_ros_to_the_byte() -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    from vislam.live.bridges import ros2
+
+    pose = known_pose(health=Health.LEVELLED | Health.DEAD_RECKONING)
+    gid = ros2.Gid(list(range(ros2._GID_BYTES)))
+    node = ros2.NodeEntitiesInfo("/", "vislam", [], [gid, gid])
+    for name, message in {
+        "nav_msgs/msg/Odometry": ros2.odometry(pose, 5),
+        "tf2_msgs/msg/TFMessage": ros2.transforms(pose, 6),
+        "std_msgs/msg/UInt32": ros2.UInt32(7),
+        "diagnostic_msgs/msg/DiagnosticArray": ros2.diagnosis(pose, 8),
+        "rmw_dds_common/msg/ParticipantEntitiesInfo": ros2.ParticipantEntitiesInfo(gid, [node]),
+    }.items():
+        store, data = get_typestore(Stores.ROS2_JAZZY), message.serialize(use_version_2=False)
+        assert bytes(store.serialize_cdr(store.deserialize_cdr(data, name), name)) == data, name
+
+
+@needs_dds
+@pytest.mark.parametrize(
+    ("health", "level", "says"),
+    [
+        (Health.LEVELLED | Health.VISION_OK | Health.AT_REST, 0, "OK"),
+        (Health.LEVELLED | Health.DEAD_RECKONING | Health.IMU_GAP, 1, "DEAD_RECKONING, IMU_GAP"),
+        (Health.LEVELLED | Health.INVALID | Health.IMU_MISSING, 2, "INVALID, IMU_MISSING"),
+        (Health(0), 2, "not LEVELLED"),
+    ],
+)
+def test_diagnostics_name_the_faults(health: Health, level: int, says: str) -> None:
+    from vislam.live.bridges.ros2 import diagnosis
+
+    (status,) = diagnosis(known_pose(health=health), 1).status
+    assert (status.level, status.message) == (level, says)
+    assert {pair.key for pair in status.values if pair.value == "True"} == {bit.name for bit in health}
+
+
 @needs_mavlink
 def test_mavlink_odometry_is_in_forward_right_down() -> None:
     from pymavlink.dialects.v20 import common

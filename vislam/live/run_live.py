@@ -138,7 +138,7 @@ class LiveRun:
     ) -> dict[str, Callable[[Life], None]]:  # fmt: skip
         """Return what each process does, with its ends of the wires."""
         suite, open_readings = live_readings(config.sensors, source.readings)
-        bridges = translator.asked(config.live)
+        bridges = translator.asked(config.live, tuple(source.rig.T_body_cams))
         send_to = (*config.live.send_to, *(at for at, _ in bridges.values()))
         samples_in, samples_out = socket.socketpair()
         front_says, fast_hears_front = self._context.Pipe(duplex=False)[::-1]

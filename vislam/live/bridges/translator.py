@@ -7,8 +7,11 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Protocol
 
+import numpy as np
+
 from vislam.config import LiveConfig
 from vislam.core.errors import UsageError, install_line
+from vislam.core.messages import Array
 from vislam.live.processes.child import Life
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import PoseListener, send_address, socket_path
@@ -29,8 +32,10 @@ class Wire(Protocol):
         ...
 
 
-def asked(live: LiveConfig) -> dict[str, tuple[str, Callable[[Life], None]]]:
+def asked(live: LiveConfig, T_body_cams: tuple[Array, ...] = ()) -> dict[str, tuple[str, Callable[[Life], None]]]:
     """Return the translators that are asked for, by role: where each listens, and its process's body.
+
+    Of the cameras, at `T_body_cam` [4, 4] each, ROS 2 gets the frames.
 
     Raises UsageError: a package is not installed, or a domain, address or rate that is none.
     """
@@ -43,7 +48,7 @@ def asked(live: LiveConfig) -> dict[str, tuple[str, Callable[[Life], None]]]:
         _require("cyclonedds", "ros2", "--live.ros2-domain")
         if not 0 <= live.ros2_domain < _DOMAINS:
             raise UsageError(f"--live.ros2-domain {live.ros2_domain}: DDS has domains 0 to {_DOMAINS - 1}")
-        wires["ros2"] = partial(_open_ros2, live.ros2_domain, live.allow_remote)
+        wires["ros2"] = partial(_open_ros2, live.ros2_domain, sensor_frames(live, T_body_cams), live.allow_remote)
     if live.mavlink is not None:
         _require("pymavlink", "mavlink", "--live.mavlink")
         send_address(live.mavlink, live.name, live.allow_remote)
@@ -93,10 +98,18 @@ def _require(package: str, extra: str, option: str) -> None:
         raise UsageError(f"{option} needs {package}; install it: {install_line(extra)}")
 
 
-def _open_ros2(domain: int, allow_remote: bool) -> Wire:
+def sensor_frames(live: LiveConfig, T_body_cams: tuple[Array, ...]) -> dict[str, Array]:
+    """Return `T_base_sensor` [4, 4] by ROS's names of frames: optical ones have z ahead (REP-103)."""
+    T_base_body = np.eye(4)
+    T_base_body[:3, 3] = -np.asarray(live.base_offset_m)
+    cameras = {f"cam{k}_optical": T_base_body @ T for k, T in enumerate(T_body_cams)}
+    return {"imu_link": T_base_body, **cameras}
+
+
+def _open_ros2(domain: int, sensors: dict[str, Array], allow_remote: bool) -> Wire:
     from vislam.live.bridges.ros2 import Ros2
 
-    return Ros2(domain, allow_remote)
+    return Ros2(domain, sensors, allow_remote)
 
 
 def _open_mavlink(to: str, name: str, allow_remote: bool) -> Wire:
