@@ -1,15 +1,15 @@
 """Cameras and rigs: projection, unprojection, undistortion of points and images, stereo rectification.
 
-Three distortion models on a pinhole with pixel skew: radial-tangential (Brown; k1, k2, p1, p2[, k3], as in OpenCV),
-rational (the same over a polynomial; k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV's CALIB_RATIONAL_MODEL and ROS have it)
-and equidistant (Kannala-Brandt, PAMI 2006; k1..k4, as in OpenCV's fisheye and in Kalibr).
+Models on a pinhole with pixel skew: radial-tangential (Brown; k1, k2, p1, p2[, k3], as in OpenCV), rational (the same
+over a polynomial; k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV's CALIB_RATIONAL_MODEL and ROS have it), equidistant
+(Kannala-Brandt, PAMI 2006; k1..k4, as in OpenCV's fisheye and in Kalibr), and those over spheres, which see beyond 90
+degrees: ucm, eucm, ds, omni (`vislam.core.lens`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,43 +18,51 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.jit import njit
-from vislam.core.lens import Lens, distort, imaged
+from vislam.core.lens import MODELS, SPHERES, Distortion, Lens, LensModel, bend, distort, imaged, lift, undistort
 from vislam.core.messages import Array
 from vislam.core.reading import MAX_PIXELS
 
 MapF32 = NDArray[np.float32]
-Distortion = Literal["none", "radtan", "equidistant", "rational"]
 
-_MODEL_CODES = {"none": 0, "radtan": 1, "equidistant": 2, "rational": 3}
-_COEFFICIENT_COUNTS = {"none": (0,), "radtan": (4, 5), "equidistant": (4,), "rational": (8,)}
-_MAX_NEWTON_STEPS = 20
 _MIN_Z_M = 1e-6
+_WIDEST_RAD = 1.5  # from the axis, that z = 1 takes from a lens over spheres: 86 deg, at 14 m to the side
 _LEAST_BASELINE_M = 1e-4  # less is what poses of one place differ by when they are inverted and multiplied
-_NO_COEFFICIENT = 1e-12  # of a polynomial in r^2: what it changes at any radius that a lens sees is no pixel's part
 
 
 @njit(cache=True, nogil=True)
-def _project(points: Array, lens: Lens) -> Array:
+def _project(points: Array, lens: Lens, least_cosine: float) -> Array:
     out = np.full((len(points), 2), np.nan)
     for i in range(len(points)):
-        z = points[i, 2]
-        if not z > _MIN_Z_M:
-            continue
-        u, v, _, _, _, _ = imaged(points[i, 0] / z, points[i, 1] / z, lens)
+        x, y, z = points[i]
+        if lens.model >= SPHERES:
+            if not _is_within(x, y, z, least_cosine):
+                continue
+            u, v, _, _ = bend(x, y, z, lens.model, lens.k)
+            u, v = lens.pinhole[0] * u + lens.pinhole[4] * v, lens.pinhole[1] * v
+        else:
+            if not z > _MIN_Z_M:
+                continue
+            u, v, _, _, _, _ = imaged(x / z, y / z, lens)
         out[i, 0], out[i, 1] = u + lens.pinhole[2], v + lens.pinhole[3]
     return out
 
 
 @njit(cache=True, nogil=True)
-def _project_jacobian(points: Array, pinhole: Array, model: int, k: Array) -> Array:
+def _project_jacobian(points: Array, lens: Lens, least_cosine: float) -> Array:
     out = np.full((len(points), 2, 3), np.nan)
-    fx, fy, _, _, skew = pinhole
+    fx, fy, _, _, skew = lens.pinhole
     for i in range(len(points)):
-        z = points[i, 2]
+        x, y, z = points[i]
+        if lens.model >= SPHERES:
+            if _is_within(x, y, z, least_cosine):
+                _, _, by_u, by_v = bend(x, y, z, lens.model, lens.k)
+                for j in range(3):
+                    out[i, 0, j], out[i, 1, j] = fx * by_u[j] + skew * by_v[j], fy * by_v[j]
+            continue
         if not z > _MIN_Z_M:
             continue
-        x, y = points[i, 0] / z, points[i, 1] / z
-        _, _, ux, uy, vx, vy = distort(x, y, model, k)
+        x, y = x / z, y / z
+        _, _, ux, uy, vx, vy = distort(x, y, lens.model, lens.k)
         px, py = fx * ux + skew * vx, fx * uy + skew * vy
         qx, qy = fy * vx, fy * vy
         out[i, 0, 0], out[i, 0, 1], out[i, 0, 2] = px / z, py / z, -(px * x + py * y) / z
@@ -63,62 +71,40 @@ def _project_jacobian(points: Array, pinhole: Array, model: int, k: Array) -> Ar
 
 
 @njit(cache=True, nogil=True)
-def _first_guess(u0: float, v0: float, model: int, max_r2: float) -> tuple[float, float]:
-    """Return where to begin the search of the ray to a distorted point; NaN where there is none."""
-    if model == 2:  # on the undistorted side: theta ~ bent radius
-        bent = np.sqrt(u0 * u0 + v0 * v0)
-        if bent >= 1.5:
-            return np.nan, np.nan
-        if bent > 1e-9:
-            return u0 * np.tan(bent) / bent, v0 * np.tan(bent) / bent
-    elif model == 3 and u0 * u0 + v0 * v0 > max_r2:  # where the model holds
-        shrink = 0.9 * np.sqrt(max_r2 / (u0 * u0 + v0 * v0))
-        return u0 * shrink, v0 * shrink
-    return u0, v0
+def _is_within(x: float, y: float, z: float, least_cosine: float) -> bool:
+    length = np.sqrt(x * x + y * y + z * z)
+    return length > _MIN_Z_M and z > least_cosine * length
 
 
 @njit(cache=True, nogil=True)
-def _normalise(pixels: Array, pinhole: Array, model: int, k: Array, max_r2: float) -> Array:
-    """Invert the projection by Newton's method with halved steps; NaN where no ray gives the pixel."""
-    out = np.full((len(pixels), 2), np.nan)
-    fx, fy, cx, cy, skew = pinhole
+def _rays(pixels: Array, lens: Lens) -> Array:
+    """Return rays [N, 3]: of length 1 over spheres, else with z = 1; NaN where no ray gives the pixel."""
+    out = np.full((len(pixels), 3), np.nan)
+    fx, fy, cx, cy, skew = lens.pinhole
     for i in range(len(pixels)):
         v0 = (pixels[i, 1] - cy) / fy
         u0 = (pixels[i, 0] - cx - skew * v0) / fx
         if not (np.isfinite(u0) and np.isfinite(v0)):
             continue
-        x, y = _first_guess(u0, v0, model, max_r2)
-        if np.isnan(x):
+        if lens.model >= SPHERES:
+            out[i, 0], out[i, 1], out[i, 2] = lift(u0, v0, lens.model, lens.k)
             continue
-        u, v, ux, uy, vx, vy = distort(x, y, model, k)
-        error = (u - u0) ** 2 + (v - v0) ** 2
-        for _ in range(_MAX_NEWTON_STEPS):
-            if error < 1e-24:
-                break
-            det = ux * vy - uy * vx
-            if abs(det) < 1e-12:
-                break
-            dx = (vy * (u0 - u) - uy * (v0 - v)) / det
-            dy = (ux * (v0 - v) - vx * (u0 - u)) / det
-            step = 1.0
-            improved = False
-            while step > 1e-3:
-                xn, yn = x + step * dx, y + step * dy
-                if model == 3 and xn * xn + yn * yn > max_r2:  # behind a pole other rays give the same pixel
-                    step *= 0.5
-                    continue
-                un, vn, uxn, uyn, vxn, vyn = distort(xn, yn, model, k)
-                new_error = (un - u0) ** 2 + (vn - v0) ** 2
-                if new_error < error:
-                    x, y, u, v, ux, uy, vx, vy, error = xn, yn, un, vn, uxn, uyn, vxn, vyn, new_error
-                    improved = True
-                    break
-                step *= 0.5
-            if not improved:
-                break
-        if error < 1e-18 and x * x + y * y <= max_r2:
-            out[i, 0], out[i, 1] = x, y
+        out[i, 0], out[i, 1] = undistort(u0, v0, lens.model, lens.k, lens.max_r2)
+        out[i, 2] = 1.0
     return out
+
+
+@njit(cache=True, nogil=True)
+def _normalise(pixels: Array, lens: Lens) -> Array:
+    out = _rays(pixels, lens)
+    if lens.model >= SPHERES:
+        for i in range(len(out)):
+            z = out[i, 2]
+            x, y = (out[i, 0] / z, out[i, 1] / z) if z > _MIN_Z_M else (np.nan, np.nan)
+            if not x * x + y * y <= lens.max_r2:
+                x, y = np.nan, np.nan
+            out[i, 0], out[i, 1] = x, y
+    return out[:, :2].copy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +125,9 @@ EXACT = CameraSigmas(0.0, 0.0, 0.0)  # of a simulation
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera: pinhole with skew and a distortion model; pixels are raw image coordinates.
+
+    Focal lengths are those in the middle of the image, also where Kalibr's and Basalt's (`ds`, `omni`) are 1 + xi as
+    large; the files are converted.
 
     Raises DataError when the numbers cannot be a calibration.
     """
@@ -162,11 +151,10 @@ class Camera:
             raise DataError(f"camera image size must be positive, got {self.width}x{self.height}")
         if self.width * self.height > MAX_PIXELS:
             raise DataError(f"camera images must have at most {MAX_PIXELS} pixels, got {self.width}x{self.height}")
-        if self.distortion not in _MODEL_CODES:
-            raise DataError(f"camera distortion '{self.distortion}' is unknown; known: {', '.join(_MODEL_CODES)}")
-        allowed = _COEFFICIENT_COUNTS[self.distortion]
-        if len(self.coefficients) not in allowed:
-            raise DataError(f"{self.distortion} distortion takes {allowed} coefficients, got {len(self.coefficients)}")
+        if self.distortion not in MODELS:
+            raise DataError(f"camera distortion '{self.distortion}' is unknown; known: {', '.join(MODELS)}")
+        if fault := self.model.fault(self.coefficients):
+            raise DataError(f"{self.distortion} distortion {fault}")
 
     def with_focal(self, factor: float) -> Camera:
         """Return the camera with focal lengths times a factor."""
@@ -177,57 +165,57 @@ class Camera:
         """The intrinsic matrix [3, 3]."""
         return np.array([[self.fx, self.skew_px, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    @cached_property
-    def _pinhole(self) -> Array:
-        return np.array([self.fx, self.fy, self.cx, self.cy, self.skew_px])
-
-    @cached_property
-    def _model(self) -> int:
-        return _MODEL_CODES[self.distortion]
-
-    @cached_property
-    def _k(self) -> Array:
-        k = np.zeros(max(5, len(self.coefficients)))
-        k[: len(self.coefficients)] = self.coefficients
-        return k
-
-    @cached_property
-    def _max_r2(self) -> float:
-        """Squared radius on z = 1 up to which distortion is monotonic; beyond it two rays share a pixel."""
-        if self.distortion == "none":
-            return float("inf")
-        k = self._k
-        if self.distortion == "radtan":
-            slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[4]])
-            limit = _smallest_positive_root(slope)
-            return limit if np.isfinite(limit) else float("inf")
-        if self.distortion == "rational":
-            return _rational_limit(k)
-        slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]])
-        theta = min(float(np.sqrt(_smallest_positive_root(slope))), np.deg2rad(89.5))
-        return float(np.tan(theta) ** 2)
+    @property
+    def model(self) -> LensModel:
+        """What its lens has in common with others of the same model."""
+        return MODELS[self.distortion]
 
     @cached_property
     def lens(self) -> Lens:
         """The camera as compiled code takes it."""
-        return Lens(self._pinhole, self._model, self._k, self._max_r2)
+        k = self.model.pack(self.coefficients)
+        if self.model.is_spherical:
+            max_r2 = float(np.tan(min(_WIDEST_RAD, np.arccos(self._least_cosine))) ** 2)
+        else:
+            max_r2 = self.model.limit(k)
+        pinhole = np.array([self.fx, self.fy, self.cx, self.cy, self.skew_px])
+        return Lens(pinhole, self.model.code, k, max_r2)
+
+    @cached_property
+    def _least_cosine(self) -> float:
+        """Cosine of the widest angle from the axis at which a lens over spheres has an image; 0 for a planar one."""
+        return self.model.limit(self.model.pack(self.coefficients)) if self.model.is_spherical else 0.0
 
     def project(self, points_cam_m: Array) -> Array:
-        """Return raw pixels [N, 2] of points [N, 3] in the camera frame; NaN behind the camera or beyond the model."""
-        return _project(_rows(points_cam_m, 3), self.lens)
+        """Return raw pixels [N, 2] of points [N, 3] in the camera frame; NaN beyond what the model sees.
+
+        Planar models see nothing behind the camera.
+        """
+        return _project(_rows(points_cam_m, 3), self.lens, self._least_cosine)
 
     def project_jacobian(self, points_cam_m: Array) -> Array:
-        """Return d(pixel)/d(point) [N, 2, 3] at points [N, 3] in the camera frame; NaN behind the camera."""
-        return _project_jacobian(_rows(points_cam_m, 3), self._pinhole, self._model, self._k)
+        """Return d(pixel)/d(point) [N, 2, 3] at points [N, 3] in the camera frame; NaN where `project` has none.
+
+        Planar models have it wherever a point is before the camera.
+        """
+        return _project_jacobian(_rows(points_cam_m, 3), self.lens, self._least_cosine)
 
     def normalise(self, pixels: Array) -> Array:
-        """Return undistorted coordinates [N, 2] on the plane z = 1 of raw pixels [N, 2]; NaN where none exist."""
-        return _normalise(_rows(pixels, 2), self._pinhole, self._model, self._k, self._max_r2)
+        """Return undistorted coordinates [N, 2] on the plane z = 1 of raw pixels [N, 2]; NaN where none exist.
+
+        Of a lens over spheres there are none beyond 1.5 rad from the axis; `bearings` has those.
+        """
+        return _normalise(_rows(pixels, 2), self.lens)
 
     def unproject(self, pixels: Array) -> Array:
         """Return rays [N, 3] with z = 1 of raw pixels [N, 2]; multiply by z-depth to get points."""
         xy = self.normalise(pixels)
         return np.column_stack([xy, np.ones(len(xy))])
+
+    def bearings(self, pixels: Array) -> Array:
+        """Return rays [N, 3] of length 1 of raw pixels [N, 2], over the whole field of view; NaN where none exist."""
+        rays = _rays(_rows(pixels, 2), self.lens)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def resampling_maps(self, K_inverse: Array, R_cam_new: Array, size: tuple[int, int]) -> tuple[MapF32, MapF32]:
         """Return maps [h, w] for `cv2.remap` to a pinhole view of `size` (w, h), turned by R_cam_new."""
@@ -266,21 +254,6 @@ class Camera:
 
 def _rows(values: Array, columns: int) -> Array:
     return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)
-
-
-def _rational_limit(k: Array) -> float:
-    """Return the squared radius at which r * over(r^2) / under(r^2) first turns back, or meets a pole."""
-    over = np.polynomial.Polynomial([1.0, k[0], k[1], k[4]])
-    under = np.polynomial.Polynomial([1.0, k[5], k[6], k[7]])
-    r2 = np.polynomial.Polynomial([0.0, 1.0])
-    slope = over * under + 2.0 * r2 * (over.deriv() * under - over * under.deriv())
-    return min(_smallest_positive_root(part.trim(_NO_COEFFICIENT)) for part in (slope, under))
-
-
-def _smallest_positive_root(polynomial: np.polynomial.Polynomial) -> float:
-    roots = polynomial.trim().roots()
-    positive = [float(root.real) for root in np.asarray(roots, dtype=complex) if abs(root.imag) < 1e-9 < root.real]
-    return min(positive, default=float("inf"))
 
 
 @dataclass(frozen=True)
