@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.camera import Camera, CameraSigmas, Distortion
+from vislam.core.camera import Camera, CameraSigmas
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations
+from vislam.core.lens import MODELS as LENS_MODELS
+from vislam.core.lens import Distortion
 from vislam.core.messages import Array
 from vislam.core.reading import MAX_YAML_BYTES, parse_yaml, read_text
 from vislam.datasets.images import DepthFormat
@@ -35,6 +37,10 @@ MODELS: dict[str, Distortion] = {
 }  # fmt: skip
 MODEL_NAMES: dict[Distortion, str] = {
     "radtan": "radial-tangential", "equidistant": "equidistant", "none": "none", "rational": "rational_polynomial",
+}  # fmt: skip
+_CAMERA_MODELS: dict[str, tuple[Distortion, int, tuple[Distortion, ...]]] = {  # numbers before the focal lengths
+    "pinhole": ("none", 0, tuple(MODEL_NAMES)), "eucm": ("eucm", 2, ("none",)), "ds": ("ds", 2, ("none",)),
+    "omni": ("omni", 1, ("none", "radtan")),
 }  # fmt: skip
 NOISE_KEYS = (  # of Kalibr, and the names in `ImuNoise`
     "gyroscope_noise_density", "accelerometer_noise_density", "gyroscope_random_walk", "accelerometer_random_walk",
@@ -218,21 +224,52 @@ def depth_format(path: Path, camera: Camera) -> DepthFormat:
 def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:
     """Return the camera in the keys that ASL and Kalibr share; raises DataError naming the key."""
     name = str(data.get("distortion_model", "none")).lower()
-    model = MODELS.get(name)
-    if str(data.get("camera_model", "pinhole")).lower() != "pinhole" or model is None:
+    model, kind = MODELS.get(name), str(data.get("camera_model", "pinhole")).lower()
+    lens, before, distortions = _CAMERA_MODELS.get(kind, ("none", 0, ()))
+    if model is None or model not in distortions:
         raise DataError(
-            f"{path}: '{data.get('camera_model')}', '{name}' is not supported; use pinhole with {[*MODELS]}"
+            f"{path}: '{data.get('camera_model')}', '{name}' is not supported; use pinhole with {[*MODELS]}, eucm or "
+            "ds with none, or omni with radtan or none"
         )
     width, height = numbers_in(data, "resolution", path, 2)
-    fx, fy, cx, cy = numbers_in(data, "intrinsics", path, 4)
+    *shape, fx, fy, cx, cy = numbers_in(data, "intrinsics", path, before + 4)
     coefficients = numbers_in(data, coefficients_key, path) if model != "none" else []
+    if kind != "pinhole":
+        model, coefficients = lens, [*shape, *(coefficients or [0.0] * (4 * (lens == "omni")))]
+    if lens == "eucm" and shape[1] == 1.0:
+        model, coefficients = "ucm", shape[:1]
     skew = numbers_in({"skew_px": [data.get("skew_px", 0.0)]}, "skew_px", path, 1)[0]
     stated = {key: optional_positive(data, name, path, allow_zero=True) for key, name in SIGMA_KEYS.items()}
     sigmas = CameraSigmas(**{key: value for key, value in stated.items() if value is not None})
+    K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return replace(stated_camera((int(width), int(height)), K, model, coefficients, str(path)), sigmas=sigmas)
+
+
+def stated_camera(
+    size_px: tuple[int, int], K: Array, model: Distortion, coefficients: Sequence[float], where: str
+) -> Camera:
+    """Return the camera of a file that states K [3, 3] with focal lengths as Kalibr and Basalt have them.
+
+    Raises DataError naming the file.
+    """
+    values = tuple(coefficients)
     try:
-        return Camera(int(width), int(height), fx, fy, cx, cy, skew, model, tuple(coefficients), sigmas)
+        camera = Camera(*size_px, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1], model, values)
+        return camera.with_focal(1.0 / LENS_MODELS[model].focal_in_files(values))
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{where}: {error}") from error
+
+
+def stated_lens(camera: Camera, names: Mapping[Distortion, str]) -> tuple[str, list[float], str, tuple[float, ...]]:
+    """Return what a file states of a lens: model, intrinsics, distortion's name by `names`, and its coefficients."""
+    model, k = camera.distortion, camera.coefficients
+    factor = camera.model.focal_in_files(k)
+    pinhole = [camera.fx * factor, camera.fy * factor, camera.cx, camera.cy]
+    if not camera.model.is_spherical:
+        return "pinhole", pinhole, names[model], k
+    if model == "omni":
+        return "omni", [k[0], *pinhole], names["radtan"], k[1:]
+    return ("eucm", [*k, 1.0, *pinhole], "none", ()) if model == "ucm" else (model, [*k, *pinhole], "none", ())
 
 
 def parse_noise(data: Mapping[str, Any], rate_key: str, path: Path) -> ImuNoise:
@@ -280,13 +317,14 @@ def pose_text(T: Array) -> str:
 def camera_text(camera: Camera, T_body_cam: Array | None, comment: str) -> str:
     """Return the sensor file of a camera; without a pose it has none."""
     pose = "" if T_body_cam is None else pose_text(T_body_cam)
+    kind, intrinsics, distortion, coefficients = stated_lens(camera, MODEL_NAMES)
     return (
         f"sensor_type: camera\ncomment: {json.dumps(comment)}\n{pose}"
-        f"resolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
-        f"intrinsics: {list_text([camera.fx, camera.fy, camera.cx, camera.cy])}  # fu, fv, cu, cv in pixels\n"
+        f"resolution: [{camera.width}, {camera.height}]\ncamera_model: {kind}\n"
+        f"intrinsics: {list_text(intrinsics)}  # the last four: fu, fv, cu, cv in pixels\n"
         f"skew_px: {float(camera.skew_px)!r}\n"
-        f"distortion_model: {MODEL_NAMES[camera.distortion]}\n"
-        f"distortion_coefficients: {list_text(camera.coefficients)}\n"
+        f"distortion_model: {distortion}\n"
+        f"distortion_coefficients: {list_text(coefficients)}\n"
         + "".join(f"{name}: {float(getattr(camera.sigmas, key))!r}\n" for key, name in SIGMA_KEYS.items())
     )
 

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.camera import Camera, Distortion
+from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
+from vislam.core.lens import Distortion
 from vislam.core.messages import Array
-from vislam.datasets.calibration import SIGMA_KEYS, Keys, list_text, numbers_in, parse_camera, read_pose
+from vislam.datasets.calibration import SIGMA_KEYS, Keys, list_text, numbers_in, parse_camera, read_pose, stated_lens
 from vislam.datasets.foreign_cameras import foreign_cameras, load_keys
 
 _MAX_CAMERAS = 2
@@ -101,7 +102,12 @@ def camchain_text(cameras: Sequence[CameraCalibration], comment: str) -> str:
 
 
 def camera_info_text(camera: Camera, name: str) -> str:
-    """Return ROS's camera calibration file; the lens has no rectification, the projection matrix is K."""
+    """Return ROS's camera calibration file; the lens has no rectification, the projection matrix is K.
+
+    Raises DataError for a lens over spheres, which ROS does not have.
+    """
+    if camera.model.is_spherical:
+        raise DataError(f"ROS has no {camera.distortion} lens; use camchain.yaml, or --model equidistant")
     coefficients = list(camera.coefficients)
     if camera.distortion != "equidistant":
         coefficients += [0.0] * (5 - len(coefficients))
@@ -121,11 +127,12 @@ def _chain_entry(index: int, found: CameraCalibration) -> str:
     lines = [f"cam{index}:"]
     if found.T_body_cam is not None:
         lines += ["  T_cam_imu:", *(f"  - {list_text(row)}" for row in invert(found.T_body_cam))]
+    kind, intrinsics, distortion, coefficients = stated_lens(camera, _KALIBR_MODELS)
     lines += [
-        "  camera_model: pinhole",
-        f"  intrinsics: {list_text([camera.fx, camera.fy, camera.cx, camera.cy])}",
-        f"  distortion_model: {_KALIBR_MODELS[camera.distortion]}",
-        f"  distortion_coeffs: {list_text(camera.coefficients)}",
+        f"  camera_model: {kind}",
+        f"  intrinsics: {list_text(intrinsics)}",
+        f"  distortion_model: {distortion}",
+        f"  distortion_coeffs: {list_text(coefficients)}",
         f"  resolution: [{camera.width}, {camera.height}]",
         f"  rostopic: /cam{index}/image_raw",
     ]

@@ -16,12 +16,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from vislam.core.camera import Camera, Distortion
+from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, rotation_from_quaternion_xyzw, transform
+from vislam.core.lens import MODELS, Distortion
 from vislam.core.messages import Array
 from vislam.core.reading import MAX_YAML_BYTES, read_text
-from vislam.datasets.calibration import NOISE_KEYS, WEIGHTY, Keys, load_yaml, numbers_in
+from vislam.datasets.calibration import NOISE_KEYS, WEIGHTY, Keys, load_yaml, numbers_in, stated_camera
 from vislam.datasets.tables import check_size
 
 _RATIONAL = "rational_polynomial"
@@ -195,7 +196,11 @@ def _vins_lens(data: Keys, path: Path) -> Camera:
         K = _intrinsics(*(float(projection[name]) for name in ("mu", "mv", "u0", "v0")))
         k = [float(projection[name]) for name in ("k2", "k3", "k4", "k5")]
         return ros_camera((size[0], size[1]), K, "equidistant", k, str(path))
-    raise DataError(f"{path}: VINS's camera model {kind} is not supported; use PINHOLE or KANNALA_BRANDT")
+    if kind == "MEI":
+        K = _intrinsics(*(float(projection[name]) for name in ("gamma1", "gamma2", "u0", "v0")))
+        k = [data["mirror_parameters"]["xi"], *(data["distortion_parameters"].get(name, 0.0) for name in _RADTAN)]
+        return stated_camera((size[0], size[1]), K, "omni", [float(value) for value in k], str(path))
+    raise DataError(f"{path}: VINS's camera model {kind} is not supported; use PINHOLE, KANNALA_BRANDT or MEI")
 
 
 def _orb_slam(data: Keys, path: Path) -> list[StatedCamera]:
@@ -245,13 +250,18 @@ def _basalt(data: Keys, path: Path) -> list[StatedCamera]:
         kind, values = str(lens["camera_type"]), lens["intrinsics"]
         models = {"pinhole": ("none", ()), "kb4": ("equidistant", ("k1", "k2", "k3", "k4"))}
         models["pinhole-radtan8"] = (_RATIONAL, _FULL)
-        if kind not in models:
+        spheres: dict[str, Distortion] = {"ucm": "ucm", "eucm": "eucm", "ds": "ds"}
+        if kind not in models and kind not in spheres:
             raise DataError(
-                f"{path}: Basalt's camera model {kind} is not supported; calibrate with kb4, or with Kalibr"
+                f"{path}: Basalt's camera model {kind} is not supported; calibrate with kb4, ds, eucm, or with Kalibr"
             )
-        name, of = models[kind]
-        K = _intrinsics(*(float(values[part]) for part in ("fx", "fy", "cx", "cy")))
-        camera = ros_camera((int(size[0]), int(size[1])), K, name, [float(values[k]) for k in of], str(path))
+        name, of = models.get(kind) or ("", MODELS[spheres[kind]].names)
+        K, k = _intrinsics(*(float(values[part]) for part in ("fx", "fy", "cx", "cy"))), [float(values[k]) for k in of]
+        size_px = (int(size[0]), int(size[1]))
+        if kind in spheres:
+            camera = stated_camera(size_px, K, spheres[kind], k, str(path))
+        else:
+            camera = ros_camera(size_px, K, name, k, str(path))
         q = np.array([float(pose[f"q{axis}"]) for axis in "xyzw"])
         if not abs(np.linalg.norm(q) - 1.0) < _RIGID:
             raise DataError(f"{path}: a quaternion of T_imu_cam is not of length 1: {q.tolist()}")

@@ -1,7 +1,7 @@
 """Intrinsics of a camera from views of a board: Zhang's method through OpenCV, then our own refinement with sigmas.
 
 Zhang, "A flexible new technique for camera calibration", PAMI 2000. OpenCV gives no sigmas for fisheye lenses and none
-that hold when the errors of one view belong together (a bent board, blur). Here both models are refined by
+that hold when the errors of one view belong together (a bent board, blur). Here all models are refined by
 Gauss-Newton on `vislam.core.camera.Camera`, the poses eliminated; sigmas come from the scatter of residuals, or from
 leaving out one view at a time (a jackknife of one step) where that is larger.
 """
@@ -15,15 +15,16 @@ import cv2
 import numpy as np
 
 from vislam.calibration.cameras.board import View
+from vislam.calibration.cameras.unified import WIDE, from_unified, unified_start
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import se3_exp, so3_exp, transform
 from vislam.core.jackknife import jackknife_variances, moves_without
 from vislam.core.messages import Array, Bools
 
-Model = Literal["radtan", "radtan5", "equidistant"]
+Model = Literal["radtan", "radtan5", "equidistant", "ucm", "eucm", "ds", "omni"]
 
-COEFFICIENTS: dict[Model, int] = {"radtan": 4, "radtan5": 5, "equidistant": 4}
+COEFFICIENTS: dict[Model, int] = {"radtan": 4, "radtan5": 5, "equidistant": 4}  # of planar models
 _ITERATIONS = 30
 _CONVERGED = 1e-4  # px: of all residuals together that a step still changes
 _OUTLIER_SIGMAS = 5.0
@@ -82,6 +83,11 @@ def fit_lens(views: list[View], size: tuple[int, int], model: Model, with_skew: 
 
 
 def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Camera, list[Array]]:
+    if model in WIDE:
+        camera, poses = unified_start(views, size)
+        good = [np.ones(len(view.points_m), dtype=np.bool_) for view in views]
+        camera, poses = _refine(camera, poses, views, good, False)
+        return from_unified(camera, WIDE[model]), poses
     points = [view.points_m.astype(np.float32)[:, None] for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
     try:
@@ -116,8 +122,8 @@ def _start(views: list[View], size: tuple[int, int], model: Model) -> tuple[Came
 
 def parameter_names(camera: Camera, with_skew: bool = False) -> list[str]:
     """Return the names of what `parameters_of` returns."""
-    k = ["k1", "k2", "k3", "k4"] if camera.distortion == "equidistant" else ["k1", "k2", "p1", "p2", "k3"]
-    return ["fx", "fy", "cx", "cy", *(["s"] if with_skew else []), *k[: len(camera.coefficients)]]
+    k = camera.model.names[: len(camera.coefficients)]
+    return ["fx", "fy", "cx", "cy", *(["s"] if with_skew else []), *k]
 
 
 def parameters_of(camera: Camera, with_skew: bool = False) -> Array:
@@ -237,7 +243,7 @@ def direction_sigma_px(fit: LensFit, columns: int, rows: int) -> Array:
     """
     camera = fit.camera
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows))
-    rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()]))
+    rays = camera.bearings(np.column_stack([u.ravel(), v.ravel()]))
     seen = np.isfinite(rays).all(axis=1)
     out = np.full(len(rays), np.nan)
     J = by_parameters(camera, rays[seen], fit.with_skew)

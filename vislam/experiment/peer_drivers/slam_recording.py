@@ -42,10 +42,9 @@ class Euroc:
             sys.exit(f"{root} has no camera {missing[0]}")
         self.sensors = [self._yaml(camera) for camera in cameras]
         for sensor in self.sensors:
-            if sensor.get("distortion_model", "none") not in _RADTAN:
-                sys.exit(
-                    f"{root}: lenses of model {sensor['distortion_model']} are not for this peer; radial-tangential"
-                )
+            kind, distortion = sensor.get("camera_model", "pinhole"), sensor.get("distortion_model", "none")
+            if kind != "pinhole" or distortion not in _RADTAN:
+                sys.exit(f"{root}: lenses of model {kind}, {distortion} are not for this peer; radial-tangential")
         self.T_body_cams = [np.array(s["T_BS"]["data"], dtype=float).reshape(4, 4) for s in self.sensors]
         self.imu = self._yaml("imu0")
         images = [self._images(camera) for camera in cameras]
