@@ -53,8 +53,10 @@ class CameraOptions:
     source: Positional[str]
     """Folder of images, video file, recording (its cam0), or webcam:DEVICE for a live one"""
     board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
-    model: Literal["radtan", "radtan5", "equidistant"] = "radtan"
-    """radtan: k1 k2 p1 p2; radtan5: and k3, which Kalibr does not know; equidistant: lenses of over 100 degrees"""
+    model: Literal["auto", "radtan", "radtan5", "equidistant", "ucm", "eucm", "ds", "omni"] = "auto"
+    """radtan: k1 k2 p1 p2; radtan5: and k3, which Kalibr does not know; equidistant: lenses of over 100 degrees; ucm,
+    eucm, ds (double sphere), omni (Mei with radtan): up to 200 degrees and more, not for ROS; auto: what the views
+    speak for"""
     skew: bool = False
     """Estimate the skew s of K as well: 0 for nearly every sensor, not so for a film that was scanned aslant"""
     max_images: Count = 300

@@ -10,7 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vislam.calibration.cameras.board import View, board_of
-from vislam.calibration.cameras.lens import LensFit, direction_sigma_px, fit_lens
+from vislam.calibration.cameras.evidence import choose_lens
+from vislam.calibration.cameras.lens import LensFit, Model, direction_sigma_px, fit_lens
+from vislam.calibration.cameras.unified import WIDE
 from vislam.calibration.cameras.views import Found, choose, find_views, images_of, live_images
 from vislam.calibration.options import CameraOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
@@ -37,9 +39,11 @@ class CameraResult:
 
     found: Found
     views: list[View]
+    model: Model
     fit: LensFit
     covered: Array  # [rows, columns] corners seen in each cell
     tilts_deg: Array  # [V] of the board against the image
+    criterion: Mapping[Model, float]  # of each model that was tried, beyond the best's
 
 
 def calibrate_camera(options: CameraOptions) -> Outcome:
@@ -55,7 +59,10 @@ def calibrate_camera(options: CameraOptions) -> Outcome:
     )
     path = folder.write_text("camchain.yaml", camchain_text([CameraCalibration(camera)], comment))
     folder.write_text("camera.yaml", camera_text(camera, None, comment))
-    folder.write_text("camera_info.yaml", camera_info_text(camera, "cam0"))
+    if not camera.model.is_spherical:
+        folder.write_text("camera_info.yaml", camera_info_text(camera, "cam0"))
+    else:
+        (options.out / "camera_info.yaml").unlink(missing_ok=True)  # of an earlier calibration
     folder.write_picture("camera.png", (11.0, 7.4), lambda figure, colors: draw(figure, colors, result))
     folder.write_report("camera.json", report)
     lines = (*_lines(result), f"next: vislam run ... --calibration.camera {path}")
@@ -78,9 +85,13 @@ def solve_camera(found: Found, options: CameraOptions) -> CameraResult:
     share = float(np.mean(covered > 0))
     refuse(what, [] if share >= _MIN_COVERED else [f"only {share:.0%} of the image has seen corners of the board; "
                                                   f"show it {_empty_parts(covered)}"])  # fmt: skip
-    fit = fit_lens(views, found.size, options.model, options.skew)
+    if options.model == "auto":
+        model, fit, criterion = choose_lens(views, found.size, options.skew)
+    else:
+        model, criterion = options.model, {}
+        fit = fit_lens(views, found.size, model, options.skew)
     tilts = np.array([_tilt_deg(T) for T in fit.T_cam_board])
-    result = CameraResult(found, views, fit, covered, tilts)
+    result = CameraResult(found, views, model, fit, covered, tilts, criterion)
     refuse(what, _doubts(result))
     return result
 
@@ -152,6 +163,13 @@ def _statements(result: CameraResult) -> list[str]:
         f"rays are right to {np.nanmedian(grid):.2f} px in the middle of all and {np.nanmax(grid):.2f} px in the worst "
         "corner (1 sigma, a common turn left away)"
     ]
+    if result.criterion:
+        others = ", ".join(f"{name} {beyond:+.0f}" for name, beyond in result.criterion.items() if name != result.model)
+        said.append(
+            f"the lens is {result.model}, by evidence; Schwarz's criterion of the others: {others or 'none fits'}"
+        )
+    if result.model in WIDE:
+        said.append("ROS has no such lens: camera_info.yaml is not written; --model equidistant has it")
     if result.fit.grouping > 2.0:
         said.append(
             f"views contradict each other {np.sqrt(result.fit.grouping):.1f} times as much as their corners scatter (a "
@@ -179,7 +197,8 @@ def _report(result: CameraResult, options: CameraOptions) -> dict[str, Any]:
     }
     return {
         "kind": "camera",
-        "model": options.model,
+        "model": result.model,
+        "criterion": dict(result.criterion),
         "size": list(result.found.size),
         "parameters": dict(zip(fit.names, fit.values.tolist(), strict=True)),
         "sigmas": dict(zip(fit.names, fit.sigmas.tolist(), strict=True)),

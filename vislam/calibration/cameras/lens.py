@@ -179,7 +179,7 @@ def _blocks(camera: Camera, poses: list[Array], views: list[View], good: list[Bo
 
 def _block(camera: Camera, T: Array, view: View, good: Bools, points: Array, by_parameter: Array) -> _Block:
     r = (view.pixels[good] - camera.project(points)).ravel()
-    A = by_parameter.reshape(len(r), -1)
+    A = by_parameter.reshape(len(r), by_parameter.shape[2])
     by_point = camera.project_jacobian(points)  # [N, 2, 3]
     board = view.points_m[good]
     turned = np.zeros((len(board), 3, 6))  # T exp(xi): rotation of the board's points on its own side
