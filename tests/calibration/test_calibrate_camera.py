@@ -11,27 +11,29 @@ import pytest
 from PIL import Image
 
 from vislam.calibration.cameras.board import Board, View
+from vislam.calibration.cameras.evidence import choose_lens
 from vislam.calibration.cameras.lens import Model, direction_sigma_px, fit_lens, parameters_of
 from vislam.calibration.cameras.views import choose, live_images
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError, UsageError
+from vislam.core.lens import MODELS
 from vislam.core.messages import Array
 from vislam.datasets.camera_files import read_cameras
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
-from worlds.board import BOARD, CHESSBOARD, FISHEYE, WEBCAM, pose, see
+from worlds.board import BOARD, CHESSBOARD, DOUBLE, FISHEYE, WEBCAM, pose, pose_around, see
 from worlds.calibration import calibrate, refusal
 
 SIGMA_PX = 0.2
 
 
-def seen(camera: Camera, rng: np.random.Generator, count: int, noise: Array | None = None) -> list[View]:
-    """Views as ideal corners with white noise, without rendering; `noise` [count, 2] moves whole views."""
+def seen(camera: Camera, rng: np.random.Generator, count: int, half_rad: float | None = None) -> list[View]:
+    """Views as ideal corners with white noise, without rendering; within `half_rad` of the axis, before it if None."""
     x, y = np.meshgrid(np.arange(1, BOARD.columns), np.arange(1, BOARD.rows))
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * BOARD.square_m
     views = []
     while len(views) < count:
-        T = pose(rng, camera, BOARD)
+        T = pose(rng, camera, BOARD) if half_rad is None else pose_around(rng, camera, BOARD, half_rad)
         pixels = camera.project(points @ T[:3, :3].T + T[:3, 3])
         inside = camera.contains(pixels, 5.0)
         if inside.sum() < 12:
@@ -161,6 +163,47 @@ def test_the_skew_is_found_where_it_is_asked_for(tmp_path: Path, capsys: pytest.
     assert {read_cameras(tmp_path / "with" / name)[0].camera.skew_px for name in names} == {answer["parameters"]["s"]}
     with pytest.raises(AssertionError, match="focal length would be known to"):  # refused rather than told wrong
         calibrate(capsys, "camera", folder, "--out", tmp_path / "without")
+
+
+def test_a_lens_of_195_degrees_is_calibrated_by_the_model_that_views_speak_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out, rng = tmp_path / "wide", tmp_path / "out", np.random.default_rng(1)
+    folder.mkdir()
+    for k in range(20):
+        cv2.imwrite(str(folder / f"{k:02d}.png"), see(DOUBLE, BOARD, pose_around(rng, DOUBLE, BOARD, 1.65), rng))
+    answer = calibrate(capsys, "camera", folder, "--out", out)
+    assert answer["rms_px"] < 0.3 and answer["model"] in ("ds", "eucm")
+    assert answer["criterion"]["radtan"] > 1000.0 and abs(answer["criterion"]["ds"]) < 10.0
+    camera = read_cameras(out / "camchain.yaml")[0].camera
+    pixels = rng.uniform([0.0, 0.0], [639.0, 479.0], (500, 2))
+    rays = DOUBLE.bearings(pixels)
+    within = rays[:, 2] > np.cos(np.deg2rad(97.0))
+    assert (rays[within, 2] < 0.0).sum() > 20  # behind the camera
+    off = camera.project(rays[within]) - pixels[within]
+    assert np.abs(off - np.median(off, axis=0)).max() < 1.0
+    assert not (out / "camera_info.yaml").exists()  # ROS has no such lens
+    assert any("ROS has no such lens" in said for said in answer["statements"])
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("ucm", (0.6,)), ("eucm", (0.62, 1.15)), ("ds", (-0.25, 0.56)), ("omni", (1.4, -0.3, 0.02, 1e-3, -1e-3))],
+)
+def test_lenses_over_spheres_are_found_behind_the_camera_too(model: Model, coefficients: tuple[float, ...]) -> None:
+    camera = replace(DOUBLE, distortion=model, coefficients=coefficients)
+    views = seen(camera, np.random.default_rng(3), 20, half_rad=1.65)
+    fit = fit_lens(views, size_of(camera), model)
+    assert fit.rms_px == pytest.approx(np.sqrt(2.0) * SIGMA_PX, rel=0.1)
+    assert np.all(np.abs(fit.values - parameters_of(camera)) < 4.0 * fit.sigmas)
+    assert 0.1 < fit.sigmas[0] < 1.0
+    chosen, _, criterion = choose_lens(views, size_of(camera))
+    assert criterion[model] < 10.0 < criterion["radtan"] and len(MODELS[chosen].names) <= len(coefficients)
+
+
+def test_of_a_lens_that_radtan_explains_no_other_is_taken() -> None:
+    model, fit, criterion = choose_lens(seen(WEBCAM, np.random.default_rng(0), 16), size_of(WEBCAM))
+    assert model == "radtan" and fit.camera.distortion == "radtan" and min(criterion.values()) == 0.0
 
 
 def test_a_video_and_a_live_camera_do_as_well(

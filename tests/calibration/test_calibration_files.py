@@ -47,6 +47,8 @@ lenses = st.one_of(
     st.tuples(st.just("radtan"), st.tuples(*[numbers] * 5)),
     st.tuples(st.just("equidistant"), st.tuples(*[numbers] * 4)),
     st.tuples(st.just("rational"), st.tuples(*[numbers] * 8)),
+    st.tuples(st.just("ucm"), st.tuples(st.floats(0.0, 1.0))),
+    st.tuples(st.just("eucm"), st.tuples(st.floats(0.0, 1.0), st.floats(0.1, 0.9))),
 )
 cameras = st.builds(
     lambda size, f, c, skew, lens: Camera(*size, *f, *c, skew, *lens),
@@ -107,7 +109,7 @@ def test_asl_sensor_files_read_back(camera: Camera, T: np.ndarray | None) -> Non
     assert found.T_body_cam is None if T is None else np.array_equal(found.T_body_cam, T)
 
 
-@given(cameras)
+@given(cameras.filter(lambda camera: camera.distortion not in ("ucm", "eucm")))
 def test_ros_files_read_back(camera: Camera) -> None:
     (found,) = read_cameras(written(camera_info_text(camera, "webcam")))
     assert same_camera(found.camera, camera)
@@ -170,11 +172,52 @@ RATIONAL = camera_info_text(replace(CAMERA, coefficients=(-0.1, 0.01, 1e-4, 2e-4
 RATIONAL = RATIONAL.replace("plumb_bob", "rational_polynomial").replace("0.5]", "0.5, 0.1, 0.1, 0.1, 0.1]")
 
 
+def kalibr(model: str, intrinsics: str, coefficients: str = "[]") -> str:
+    """As Kalibr writes it: what the model takes, then focal lengths and principal point."""
+    name = "none" if coefficients == "[]" else "radtan"
+    return (
+        f"cam0:\n  cam_overlaps: []\n  camera_model: {model}\n  distortion_coeffs: {coefficients}\n"
+        f"  distortion_model: {name}\n  intrinsics: [{intrinsics}]\n  resolution: [64, 48]\n  rostopic: /cam0/i\n"
+    )
+
+
+KALIBR = {
+    "ds": kalibr("ds", "-0.2, 0.6, 40.0, 40.8, 31.5, 23.5"),
+    "eucm": kalibr("eucm", "0.6, 1.1, 50.0, 51.0, 31.5, 23.5"),
+    "ucm": kalibr("eucm", "0.6, 1.0, 50.0, 51.0, 31.5, 23.5"),
+    "omni": kalibr("omni", "1.5, 125.0, 127.5, 31.5, 23.5", "[-0.1, 0.01, 0.0001, 0.0002]"),
+    "bare": kalibr("omni", "1.5, 125.0, 127.5, 31.5, 23.5"),
+}
+
+
+@pytest.mark.parametrize(
+    ("text", "model", "coefficients"),
+    [
+        (KALIBR["ds"], "ds", (-0.2, 0.6)), (KALIBR["eucm"], "eucm", (0.6, 1.1)), (KALIBR["ucm"], "ucm", (0.6,)),
+        (KALIBR["omni"], "omni", (1.5, -0.1, 0.01, 1e-4, 2e-4)), (KALIBR["bare"], "omni", (1.5, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)  # fmt: skip
+def test_lenses_over_spheres_are_read_as_kalibr_writes_them_and_written_back(
+    text: str, model: str, coefficients: tuple[float, ...]
+) -> None:
+    camera = read_cameras(written(text))[0].camera
+    assert (camera.distortion, camera.coefficients) == (model, coefficients)
+    assert (camera.fx, camera.fy) == pytest.approx((50.0, 51.0))  # in the middle of the image
+    for again in (camchain_text([CameraCalibration(camera)], ""), camera_text(camera, None, "c")):
+        second = read_cameras(written(again))[0].camera
+        assert replace(second, fx=camera.fx, fy=camera.fy) == camera and second.fx == pytest.approx(camera.fx)
+    with pytest.raises(DataError, match=f"ROS has no {model} lens"):
+        camera_info_text(camera, "c")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("camera_matrix: {rows: 3, cols: 3, data: [1, 2]}\nimage_width: 4\nimage_height: 4\n", "camera_matrix must"),
-        ("cam0:\n  camera_model: omni\n  intrinsics: [1.2, 50, 50, 32, 24]\n", "'omni', 'none' is not supported"),
+        ("cam0:\n  camera_model: ds\n  distortion_model: radtan\n", "'ds', 'radtan' is not supported"),
+        ("cam0:\n  camera_model: catadioptric\n", "'catadioptric', 'none' is not supported"),
+        (KALIBR["ds"].replace("-0.2", "-1.2"), "ds distortion has xi from -0.99 to 0.99, got -1.2"),
+        (KALIBR["ds"].replace("-0.2, ", ""), "intrinsics must be 6 finite numbers"),
         (RATIONAL, "not supp"),
         (camchain_text([CameraCalibration(CAMERA, np.eye(4))], "").replace("1.0, 0.0]", "2.0, 0.0]"), "not a rigid"),
         (camera_info_text(CAMERA, "c").replace("image_width: 64", "image_width: wide"), "image_width"),

@@ -21,6 +21,10 @@ WIDE = Camera(640, 400, 280.0, 280.0, 320.0, 200.0, 0.0, "rational", (2.1, 0.4, 
 IDEAL = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 CAMERAS = {"euroc": EUROC, "fr1": FR1, "fisheye": FISHEYE, "skewed": SKEWED, "ideal": IDEAL} | {
     "azure": AZURE, "wide": WIDE,
+    "ucm": Camera(640, 480, 260.0, 261.0, 318.0, 243.0, 0.0, "ucm", (0.6,)),
+    "eucm": Camera(640, 480, 260.0, 261.0, 318.0, 243.0, 0.0, "eucm", (0.62, 1.1)),
+    "ds": Camera(640, 480, 260.0, 261.0, 318.0, 243.0, -0.7, "ds", (-0.2, 0.58)),
+    "omni": Camera(640, 480, 260.0, 261.0, 318.0, 243.0, 0.0, "omni", (1.4, -0.1, 0.02, 1e-3, -1e-3)),
 }  # fmt: skip
 every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 

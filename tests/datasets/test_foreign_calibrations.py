@@ -53,14 +53,21 @@ def vins_lens(kind: str = "PINHOLE") -> str:
             + "projection_parameters:\n"
             + parts("   ", (*FISHEYE.coefficients, *PINHOLE), "k2 k3 k4 k5 mu mv u0 v0")
         )
+    if kind == "MEI":
+        head += "mirror_parameters:\n   xi: 1.5\ndistortion_parameters:\n"
+        head += parts("   ", RADTAN.coefficients, "k1 k2 p1 p2") + "projection_parameters:\n"
+        return head + parts("   ", (125.0, 127.5, 31.5, 23.5), "gamma1 gamma2 u0 v0")
     lens = "distortion_parameters:\n" + parts("   ", RADTAN.coefficients, "k1 k2 p1 p2")
     return f"{head}{lens}projection_parameters:\n" + parts("   ", PINHOLE, "fx fy cx cy")
 
 
 def basalt(kind: str = "kb4", **more: object) -> str:
-    names = {"kb4": "k1 k2 k3 k4", "pinhole-radtan8": "k1 k2 p1 p2 k3 k4 k5 k6"}.get(kind, "xi alpha")
-    values = {"kb4": FISHEYE.coefficients, "pinhole-radtan8": RATIONAL.coefficients}.get(kind, (0.1, 0.5))
-    lens = dict(zip(["fx", "fy", "cx", "cy", *names.split()], [*PINHOLE, *values], strict=True))
+    names, values = {
+        "kb4": ("k1 k2 k3 k4", FISHEYE.coefficients), "ucm": ("alpha", (0.6,)), "eucm": ("alpha beta", (0.6, 1.1)),
+        "pinhole-radtan8": ("k1 k2 p1 p2 k3 k4 k5 k6", RATIONAL.coefficients),
+    }.get(kind, ("xi alpha", (0.25, 0.5)))  # fmt: skip
+    pinhole = (62.5, 63.75, *PINHOLE[2:]) if kind == "ds" else PINHOLE
+    lens = dict(zip(["fx", "fy", "cx", "cy", *names.split()], [*pinhole, *values], strict=True))
     poses = [dict(zip(["px", "py", "pz", "qx", "qy", "qz", "qw"],
                       [*T[:3, 3], *quaternion_xyzw(T[:3, :3])], strict=True)) for T in (T0, T0 @ T01)]  # fmt: skip
     noise = {"accel_noise_std": [2e-3] * 3, "gyro_noise_std": [1.7e-4] * 3, "accel_bias_std": [3e-3] * 3}
@@ -116,6 +123,10 @@ R4, K4 = "k1 k2 p1 p2", "k1 k2 k3 k4"
         (vins_lens() + VINS.replace("extrinsic: 1", "extrinsic: 2"), RADTAN, [None], 0.002),
         (basalt(), FISHEYE, [T0, T0 @ T01], 0.002),
         (basalt("pinhole-radtan8"), RATIONAL, [T0, T0 @ T01], 0.002),
+        (basalt("ds"), Camera(*SIZE, *PINHOLE, 0.0, "ds", (0.25, 0.5)), [T0, T0 @ T01], 0.002),
+        (basalt("ucm"), Camera(*SIZE, *PINHOLE, 0.0, "ucm", (0.6,)), [T0, T0 @ T01], 0.002),
+        (basalt("eucm"), Camera(*SIZE, *PINHOLE, 0.0, "eucm", (0.6, 1.1)), [T0, T0 @ T01], 0.002),
+        (vins_lens("MEI"), Camera(*SIZE, *PINHOLE, 0.0, "omni", (1.5, *RADTAN.coefficients)), [None], None),
         (opencv(D5), RADTAN, [None], None),
         (opencv(D8), RATIONAL, [None], None),
         (opencv(D4, more="fisheye_model: 1\n"), FISHEYE, [None], None),
@@ -152,10 +163,11 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (basalt("ds"), "Basalt's camera model ds is not supported"),
+        (basalt("fov"), "Basalt's camera model fov is not supported"),
         (basalt(T_cam_mocap=1.0), "meaning of T_cam_mocap is not known"),
         (basalt().replace('"px"', '"x"'), "looks like a file of Basalt.*no 'px'"),
-        (vins_lens("MEI"), "VINS's camera model MEI is not supported"),
+        (vins_lens("SCARAMUZZA"), "VINS's camera model SCARAMUZZA is not supported"),
+        (vins_lens("MEI").replace("xi", "x"), "looks like a file of VINS.*no 'xi'"),
         (vins_lens().replace("fx", "f"), "looks like a file of VINS.*no 'fx'"),
         (vins_lens() + matrix("body_T_lidar", T0), "meaning of body_T_lidar is not known"),
         (orb("Omni", R4, RADTAN.coefficients, ""), "ORB-SLAM's camera model Omni is not supported"),

@@ -4,7 +4,7 @@ Two families. Planar ones map the plane z = 1 onto itself: `radtan`, `rational`,
 a ray (x, y, z) to (x, y) / s, where s depends on z and x^2 + y^2 alone, and so see beyond 90 degrees:
 
 - `ucm`, `eucm`: Khomutenko, Garcia, Martinet, "An enhanced unified camera model", RA-L 2016; ucm has beta = 1
-- `ds`: Usenko, Demmel, Cremers, "The double sphere camera model", 3DV 2018; so are the cones in which rays are unique
+- `ds`: Usenko, Demmel, Cremers, "The double sphere camera model", 3DV 2018
 - `omni`: Mei and Rives, "Single view point omnidirectional camera calibration from planar grids", ICRA 2007, with
   radtan on (x, y) / s; Kalibr's omni-radtan
 
@@ -155,6 +155,9 @@ def bend(
         return u, v, row, column
     scale = 1.0 + k[_XI]  # Mei's radtan acts before the focal length, which is his own
     bent_u, bent_v, uu, uv, vu, vv = distort(u / scale, v / scale, 1, k)
+    if not uu * vv - uv * vu > 0.0:  # beyond the fold, which p1 and p2 move
+        nothing = (np.nan, np.nan, np.nan)
+        return np.nan, np.nan, nothing, nothing
     return (
         bent_u * scale, bent_v * scale,
         (uu * row[0] + uv * column[0], uu * row[1] + uv * column[1], uu * row[2] + uv * column[2]),
@@ -170,7 +173,8 @@ def lift(u: float, v: float, model: int, k: Array) -> tuple[float, float, float]
         u, v = undistort(u / (1.0 + xi), v / (1.0 + xi), 1, k, k[_LIMIT])
         r2 = u * u + v * v
         inside = 1.0 + (1.0 - xi * xi) * r2
-        if not inside > 0.0:
+        _, _, uu, uv, vu, vv = distort(u, v, 1, k)
+        if not (inside > 0.0 and uu * vv - uv * vu > 0.0):
             return np.nan, np.nan, np.nan
         f = (xi + np.sqrt(inside)) / (1.0 + r2)
         return f * u, f * v, f - xi
@@ -181,8 +185,7 @@ def lift(u: float, v: float, model: int, k: Array) -> tuple[float, float, float]
     if not inside > 0.0:
         return np.nan, np.nan, np.nan
     z = (1.0 - beta * alpha * alpha * r2) / (alpha * np.sqrt(inside) + 1.0 - alpha)
-    under = z * z + r2
-    f = (z * xi + np.sqrt(z * z + (1.0 - xi * xi) * r2)) / under  # with xi = 0 of length 1 already
+    f = (z * xi + np.sqrt(z * z + (1.0 - xi * xi) * r2)) / (z * z + r2)
     return f * u, f * v, f * z - xi
 
 
@@ -233,9 +236,14 @@ def _sphere_cosine(k: Array) -> float:
 
 
 def _double_cosine(k: Array) -> float:
-    """Return the cosine of the widest angle of a double sphere (Usenko et al. 2018)."""
+    """Return the cosine of the widest angle of a double sphere.
+
+    It is where the ray meets the edge -w of the second sphere's cone: (xi + c)^2 = w^2 (1 + 2 xi c + xi^2). The paper's
+    w2 is a little narrower.
+    """
     xi, w = k[0], _steepest(k[1])
-    return float(-(w + xi) / np.sqrt(2.0 * w * xi + xi * xi + 1.0))
+    narrowed = 1.0 - w * w
+    return float(-xi * narrowed - w * np.sqrt(1.0 - xi * xi * narrowed))
 
 
 def _omni_cosine(k: Array) -> float:
