@@ -204,7 +204,8 @@ def imaged(x: float, y: float, lens: Lens) -> tuple[float, float, float, float, 
 
 def radial_limit(k: Array) -> float:
     """Return the squared radius at which 1 + k1 r^2 + k2 r^4 + k3 r^6, times r, first turns back (k3 is k[4])."""
-    return _smallest_positive_root(np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[4]]))
+    slope = np.polynomial.Polynomial([1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[4]])
+    return _smallest_positive_root(slope.trim(_NO_COEFFICIENT))
 
 
 def _equidistant_limit(k: Array) -> float:

@@ -169,7 +169,7 @@ def _statements(result: CameraResult) -> list[str]:
             f"the lens is {result.model}, by evidence; Schwarz's criterion of the others: {others or 'none fits'}"
         )
     if result.model in WIDE:
-        said.append("ROS has no such lens: camera_info.yaml is not written; --model equidistant has it")
+        said.append("ROS has no such lens: camera_info.yaml is not written; --model equidistant is one that it has")
     if result.fit.grouping > 2.0:
         said.append(
             f"views contradict each other {np.sqrt(result.fit.grouping):.1f} times as much as their corners scatter (a "
