@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 import vislam
-from vislam.core.camera import EXACT, Camera, Rig
+from vislam.core import Camera, Rig
 
 
 def ate_m(painted, model: str, coefficients: tuple[float, ...]) -> float:
     """Return the error of a stereo run through a room, by cameras of a model that see 120 degrees across."""
-    camera = Camera(320, 240, 145.0, 145.0, 159.0, 121.0, 0.0, model, coefficients, EXACT)
     world = painted("handheld-room", seed=3, rig="stereo", image_width_px=320, duration_s=7.0, camera_hz=10.0)
+    sigmas = world.rig.cameras[0].sigmas
+    camera = Camera(320, 240, 145.0, 145.0, 159.0, 121.0, 0.0, model, coefficients, sigmas)
     world.rig = Rig((camera, camera), world.rig.T_body_cams)
     slam = vislam.Slam(vislam.Config(), world.rig, world.imu_noise)
     steps = [step for value in world.events() for step in slam.feed(value) if step.T_map_body is not None]
