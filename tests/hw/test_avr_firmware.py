@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from needs import missing
-from vislam.hw.bridge.protocol import Chips, FrameDecoder, Hello, RawSample, Spent, Status
+from vislam.hw.bridge.protocol import Chips, Counts, FrameDecoder, Hello, RawSample, Spent, Status
 
 SKETCH = Path(str(files("vislam.hw"))) / "firmware" / "vislam_bridge" / "vislam_bridge.ino"
 HERE = Path(__file__).parent / "real_avr"
@@ -149,6 +149,26 @@ def test_a_stuck_bus_stops_nothing_and_is_freed(tools: tuple[Path, Path], held_m
     after = [s.t_us for s in board.samples if s.t_us > FAULT_US + 1000 * held_ms and not s.status & bad]
     assert after[0] - (FAULT_US + 1000 * held_ms) < 50_000
     assert all(not s.status & bad for s in board.samples[-100:])
+
+
+@pytest.mark.parametrize(
+    ("edges_s", "right_a", "is_fast", "is_exact"),
+    [(10_000, 3, False, True), (14_000, 3, True, True), (20_000, 3, True, False),
+     (18_000, 7, False, True), (32_000, 7, True, False)],
+)  # fmt: skip
+def test_no_edge_is_counted_wrong_without_being_stated(
+    tmp_path: Path, tools: tuple[Path, Path], edges_s: int, right_a: int, is_fast: bool, is_exact: bool
+) -> None:
+    pins = ("-DLEFT_A=2", "-DLEFT_B=4", f"-DRIGHT_A={right_a}", "-DRIGHT_B=5")  # pin 7 stands still
+    firmware, _ = build(tmp_path, "standard", *pins)
+    board = Board((tools[0], firmware), 3.4, f"500:edges:{edges_s:x}", "1500:edges:0")
+    made = [int(n) for n in re.findall(r"^edges (\d+) (\d+)$", board.log, re.MULTILINE)[0]]
+    counts = [m for m in board.messages if isinstance(m, Counts)][-1]
+    wrong = max(abs(counts.left - made[0]), abs(counts.right - made[1]) if right_a == 3 else 0)
+    print(f"{edges_s} edges a second: {wrong} of {made[0]} wrong")
+    assert (wrong <= 1) == is_exact
+    assert any(Chips.FAST_EDGES in hello.chips for hello in board.hellos) == is_fast
+    assert Chips.FAST_EDGES not in board.hellos[-1].chips, "it is over"
 
 
 def test_a_reset_is_stated(tools: tuple[Path, Path]) -> None:

@@ -196,6 +196,13 @@ def test_encoders_and_a_receiver_travel_beside_the_samples(full_bridge: Path, be
     assert all(Status.MISSED not in sample.status for sample in samples)
 
 
+@pytest.mark.parametrize(("edges_s", "is_fast"), [(9_000, False), (11_000, True)])
+def test_edges_too_fast_to_be_counted_for_sure_are_stated(full_bridge: Path, edges_s: int, is_fast: bool) -> None:
+    quarters_s = str(2 * edges_s)  # of each wheel, one of which goes back; the limit is 20 000 edges of both
+    hellos = parts(run(full_bridge, 3.0, further=(quarters_s, f"-{quarters_s}", SENTENCE))[0])[1]
+    assert [Chips.FAST_EDGES in hello.chips for hello in hellos[1:]] == [is_fast] * 2
+
+
 def test_a_line_that_takes_nothing_costs_no_count(full_bridge: Path) -> None:
     messages = run(full_bridge, 2.0, blocked=("1000", "1100"), further=("4800", "4800", SENTENCE))[0]
     counts = [m for m in messages if isinstance(m, Counts)]

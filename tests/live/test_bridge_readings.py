@@ -205,6 +205,20 @@ def test_what_a_full_socket_did_not_take_of_the_state_is_told_with_the_next_hell
     passes.close()
 
 
+def test_edges_too_fast_for_the_board_are_named_until_they_are_not() -> None:
+    passes, hears = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    passer, sensors = Passer(DeviceClock(BridgeClockConfig()), passes), PortReadings(PORTS, hears)
+    said = []
+    for n, chips in enumerate((Chips(0x1F), Chips(0x3F), Chips(0x3F), Chips(0x1F))):
+        passer.greet(Hello(n, 0, chips, 0, 0, b"   ", 400, 1, 1, 1, 1, 0, 1, 1, 1))
+        sensors.read()
+        said.append(["too fast for the board" in sensors.status()[name] for name in ("wheels", "gnss")])
+    assert said == [[False, False], [True, False], [True, False], [False, False]]
+    assert passer.counts["counts_doubted"] == 2
+    sensors.close()
+    passes.close()
+
+
 def test_stamps_besides_change_no_line() -> None:
     config = BridgeClockConfig()
     ours, theirs = DeviceClock(config), DeviceClock(config)

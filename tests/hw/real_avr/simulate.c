@@ -8,12 +8,15 @@
 //
 // Faults: nack (the next transfer to CHIP has no answer), gone, back, power (CHIP lost its supply for a moment), freeze
 // (CHIP repeats its values), hold (the bus's hardware never finishes: somebody holds SDA), free, reset.
+// MS:edges:RATE lets both encoders of a sketch with A at pins 2 and 3, B at 4 and 5 turn forward from then on, each with
+// RATE edges of A a second, in hexadecimal, the right one 0.9 times as many. Last comes what they made: "edges 12 11".
 // CHIP: 53 ADXL345, 68 ITG3205, 1e HMC5883L, with registers, reset values and order of bytes as in their data sheets.
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include <simavr/avr_ioport.h>
 #include <simavr/avr_twi.h>
 #include <simavr/avr_uart.h>
 #include <simavr/sim_avr.h>
@@ -38,6 +41,8 @@ static avr_t *avr;
 static chip chips[3] = {{.address = 0x53}, {.address = 0x68}, {.address = 0x1E}};
 static fault faults[MOST_FAULTS];
 static int fault_count, held, byte_is_first = 1;
+static double edge_rate, turned[2];  // in edges of A
+static long quarters[2];
 static const char *irq_names[] = {"8>chip.out", "32<chip.in"};
 
 static double seconds(void) { return avr->cycle / CLOCK_HZ; }
@@ -128,10 +133,23 @@ static void attach(chip *c) {
     avr_connect_irq(avr_io_getirq(avr, AVR_IOCTL_TWI_GETIRQ(0), TWI_IRQ_OUTPUT), c->irq + TWI_IRQ_OUTPUT);
 }
 
+// Going forward, A is a quarter ahead of B; an edge of A is two quarters from the next.
+static void turn(double since_s) {
+    for (int i = 0; i < 2; i++) {
+        turned[i] += (i ? 0.9 : 1.0) * edge_rate * since_s;  // so that their edges meet
+        const long now = (long)(2.0 * turned[i]);
+        if (now == quarters[i]) continue;
+        quarters[i] = now;
+        avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), 2 + i), ((now + 1) & 3) >= 2);
+        avr_raise_irq(avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), 4 + i), (now & 3) >= 2);
+    }
+}
+
 static void befall(const fault *f) {
     if (!strcmp(f->what, "hold")) held = 1;
     if (!strcmp(f->what, "free")) held = 0;
     if (!strcmp(f->what, "reset")) avr_reset(avr);
+    if (!strcmp(f->what, "edges")) edge_rate = f->address;
     for (int i = 0; i < 3; i++) {
         chip *c = &chips[i];
         if (c->address != f->address) continue;
@@ -178,9 +196,12 @@ int main(int count, char **given) {
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_byte, NULL);
     for (int next = 0; avr->cycle < end;) {
         while (next < fault_count && avr->cycle >= faults[next].cycle) befall(&faults[next++]);
+        const avr_cycle_count_t before = avr->cycle;
         const int state = avr_run(avr);
+        turn((double)(avr->cycle - before) / CLOCK_HZ);
         if (held) hold_bus();
         if (state == cpu_Done || state == cpu_Crashed) return 1;
     }
+    fprintf(stderr, "edges %ld %ld\n", (quarters[0] + 1) / 2, (quarters[1] + 1) / 2);
     return 0;
 }

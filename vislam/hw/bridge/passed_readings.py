@@ -21,6 +21,10 @@ _LACKS = {
     Chips.GNSS: "the sketch on the board passes no receiver on; set GNSS_PORT in vislam_bridge.ino of this vislam and "
     "put it on the board",
 }
+_FAST = (
+    "the encoders' edges come too fast for the board, and counts may be wrong; drive slower, or use encoders of fewer "
+    "pulses: docs/sensors/wheels.md"
+)
 
 
 class PassedReadings:
@@ -56,10 +60,13 @@ class PassedReadings:
         """Return by sensor "well", or the problem of the bridge, its sketch or the device at it."""
         asked = dict.fromkeys(self._counts, Chips.ENCODERS) | dict.fromkeys(self._fixes, Chips.GNSS)
         talks: dict[str, CountTalk | FixTalk] = {**self._counts, **self._fixes}
-        return {
-            name: self._state.problem or ("" if chip in self._state.chips else _LACKS[chip]) or talks[name].status()
-            for name, chip in asked.items()
-        }
+        return {name: self._state.problem or self._lack(chip) or talks[name].status() for name, chip in asked.items()}
+
+    def _lack(self, chip: Chips) -> str:
+        chips = self._state.chips
+        if chip not in chips:
+            return _LACKS[chip]
+        return _FAST if chip == Chips.ENCODERS and Chips.FAST_EDGES in chips else ""
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return by sensor how many readings came, and how often each fault occurred."""

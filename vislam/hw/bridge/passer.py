@@ -83,7 +83,8 @@ class Passer:
 
     def greet(self, hello: Hello) -> None:
         """Report what the device has, where it is new or has just started."""
-        chips = hello.chips & (Chips.ENCODERS | Chips.GNSS)
+        chips = hello.chips & (Chips.ENCODERS | Chips.GNSS | Chips.FAST_EDGES)
+        self.counts["counts_doubted"] += Chips.FAST_EDGES in chips
         if Chips.STARTED in hello.chips:
             self._sequences.clear()
         if Chips.STARTED in hello.chips or self._reported is None or self._reported[:2] != (chips, ""):

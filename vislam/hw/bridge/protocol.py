@@ -50,6 +50,7 @@ class Chips(IntFlag):
     MAG = 1 << 2
     ENCODERS = 1 << 3  # the sketch is configured for encoders, and counts them
     GNSS = 1 << 4  # ... of a satellite receiver, whose bytes it passes on
+    FAST_EDGES = 1 << 5  # since the last hello, encoders had more edges than the device counts for sure
     STARTED = 1 << 7  # the first hello since the device started
 
 

@@ -44,7 +44,7 @@ static const uint8_t SAMPLE_TYPE = 1, HELLO_TYPE = 2, COUNTS_TYPE = 3, PASSED_TY
 static const uint8_t STATUS_MAG_NEW = 1, STATUS_ACCEL_ERROR = 2, STATUS_GYRO_ERROR = 4, STATUS_MAG_ERROR = 8,
                      STATUS_MISSED = 16;
 static const uint8_t CHIPS_ACCEL = 1, CHIPS_GYRO = 2, CHIPS_MAG = 4, CHIPS_ENCODERS = 8, CHIPS_GNSS = 16,
-                     CHIPS_STARTED = 128;
+                     CHIPS_FAST_EDGES = 32, CHIPS_STARTED = 128;
 
 // What counts of gyro and accelerometer mean, and from which on they are saturated.
 struct Inertial {
@@ -111,6 +111,7 @@ static int16_t accel[3], gyro[3], mag[3], temperature;
 static uint16_t sequence;
 static uint32_t dueUs, helloUs;
 static bool helloPending = true, started = true, missed = false;
+static bool fastEdges = false;  // since the last hello edges came too fast to be counted for sure
 static bool isMpu = false, boardKnown = false;  // which board it is stays until the sketch starts anew
 static uint8_t strangerId;                      // that a chip says in a MPU's place, none that is known
 static uint8_t hellosOwed;                      // before another sample is sent
@@ -457,7 +458,8 @@ static bool sendHello(uint32_t timeUs) {
   beginFrame(HELLO_TYPE, sequence++, timeUs);
   put8(PROTOCOL_VERSION);
   put8((accelChip.ready ? CHIPS_ACCEL : 0) | (gyroChip.ready ? CHIPS_GYRO : 0) | (magChip.ready ? CHIPS_MAG : 0) |
-       (HAS_ENCODERS ? CHIPS_ENCODERS : 0) | (HAS_GNSS ? CHIPS_GNSS : 0) | (started ? CHIPS_STARTED : 0));
+       (HAS_ENCODERS ? CHIPS_ENCODERS : 0) | (HAS_GNSS ? CHIPS_GNSS : 0) |
+       (fastEdges ? CHIPS_FAST_EDGES : 0) | (started ? CHIPS_STARTED : 0));
   put8(boardKnown ? accelChip.id[0] : strangerId);
   put8(gyroChip.id[0]);
   for (uint8_t i = 0; i < 3; i++) put8(magChip.id[i]);
@@ -471,7 +473,7 @@ static bool sendHello(uint32_t timeUs) {
   put16(inertial.gyroLimit);
   put16(magnetic.limit);
   if (!sendFrame()) return false;
-  helloPending = started = magUntold = false;
+  helloPending = started = magUntold = fastEdges = false;
   return true;
 }
 
@@ -502,20 +504,39 @@ static bool greet(uint32_t timeUs) {
 
 static const uint32_t COUNTS_EVERY_US = 1000000UL / COUNTS_HZ;
 static const uint8_t COUNTS_WIRE = 19;
+// Of both wheels together. From about 28 on an Uno reads B after its next edge and counts the wrong way, which looks like a
+// wheel that turns back: only how many interrupts there are gives it away.
+static const uint32_t MOST_EDGES_MS = 20;
 static volatile int32_t leftCount, rightCount;
-static uint32_t countsDueUs;
+static volatile uint16_t edges;
+static uint32_t countsDueUs, edgesUs;
 static uint16_t countsSent;
 
 // Going forward, A is a quarter ahead of B, so that right after an edge of A both differ.
-static void IRAM_ATTR leftTurned() { leftCount = leftCount + (digitalRead(LEFT_A) != digitalRead(LEFT_B) ? 1 : -1); }
-static void IRAM_ATTR rightTurned() { rightCount = rightCount + (digitalRead(RIGHT_A) != digitalRead(RIGHT_B) ? 1 : -1); }
+static void IRAM_ATTR leftTurned() {
+  leftCount = leftCount + (digitalRead(LEFT_A) != digitalRead(LEFT_B) ? 1 : -1);
+  edges = edges + 1;
+}
+static void IRAM_ATTR rightTurned() {
+  rightCount = rightCount + (digitalRead(RIGHT_A) != digitalRead(RIGHT_B) ? 1 : -1);
+  edges = edges + 1;
+}
 
 static void beginEncoders() {
   const uint8_t pins[] = {LEFT_A, LEFT_B, RIGHT_A, RIGHT_B};
   for (uint8_t i = 0; i < 4; i++) pinMode(pins[i], INPUT_PULLUP);
   attachInterrupt(digitalPinToInterrupt(LEFT_A), leftTurned, CHANGE);
   attachInterrupt(digitalPinToInterrupt(RIGHT_A), rightTurned, CHANGE);
-  countsDueUs = micros();
+  countsDueUs = edgesUs = micros();
+}
+
+static void watchEdges(uint32_t timeUs) {
+  noInterrupts();
+  const uint16_t seen = edges;
+  edges = 0;
+  interrupts();
+  if (1000UL * seen > MOST_EDGES_MS * (timeUs - edgesUs)) fastEdges = true;
+  edgesUs = timeUs;
 }
 
 static void sendCounts(uint32_t timeUs) {
@@ -531,6 +552,7 @@ static void sendCounts(uint32_t timeUs) {
 }
 #else
 static void beginEncoders() {}
+static void watchEdges(uint32_t) {}
 static void sendCounts(uint32_t) {}
 #endif
 
@@ -628,6 +650,7 @@ void loop() {
       missed = true;
       dueUs = now + PERIOD_US;
     }
+    watchEdges(now);
     sampleAndSend(now);
   } else if (helloPending) {
     greet(now);
