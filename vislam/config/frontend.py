@@ -47,6 +47,8 @@ class FrontEndConfig:
     """Feature tracking and visual odometry."""
 
     mode: Mode = "auto"  # auto: the richest the recording offers
+    # masks: camK.png (all images) or camK/STAMP.png (one), below 128 where pixels are not used; docs/formats.md
+    masks: str | None = None
 
     max_tracks: Count = 400  # corners; more add little accuracy once the image is covered, and cost time
     min_distance_px: NonNegative = 12.0  # between corners; nearer ones see the same patch

@@ -116,6 +116,16 @@ class Observations:
         return f"Observations({len(self.track_ids)} tracks{right}{depth})"
 
 
+def chosen(given: Observations, which: Bools) -> Observations:
+    """Return those of tracks [N] that are chosen [N]."""
+    parts = (given.right_px, given.depth_m, given.instant_px)
+    right, depth, instant = (None if part is None else part[which] for part in parts)
+    return replace(
+        given, track_ids=given.track_ids[which], pixels_px=given.pixels_px[which], right_px=right, depth_m=depth,
+        instant_px=instant, descriptors=None if given.descriptors is None else given.descriptors[which],
+    )  # fmt: skip
+
+
 def no_observations() -> Observations:
     """Return observations of nothing."""
     return Observations(np.empty(0, dtype=np.int64), np.empty((0, 2)))
@@ -133,6 +143,11 @@ class Frame:
     tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
     depth_lag_s: float = 0.0  # how much later than the images depth was taken, by its own stamp
     follows_step: bool = False  # of the clock: how long after the frame before it was taken is not known
+    masks: tuple[ImageU8 | None, ...] = ()  # [H, W] per camera, None or left out: all of it; below 128: not to be used
+
+    def mask(self, camera: int) -> ImageU8 | None:
+        """Return the mask [H, W] of a camera; None where all of its image is to be used."""
+        return self.masks[camera] if camera < len(self.masks) else None
 
     def __repr__(self) -> str:
         has = [f"{image.shape[1]} x {image.shape[0]} px" for image in self.images]

@@ -150,7 +150,7 @@ class ByDepth:
         dt_s = (frame.t_ns - keyframe.t_ns) * 1e-9
         if dt_s < config.keyframe_min_interval_s:
             return ""
-        if tracks < MIN_START_CORNERS and frame.images and sees(frame.images[0], config):
+        if tracks < MIN_START_CORNERS and frame.images and sees(frame, 0, config):
             return "there is something to see again"
         if found.overlap < _DEPTH_ALONE_RENEW:
             return f"only {found.overlap:.0%} of the depth overlaps"

@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
-from vislam.core.messages import Frame, ImageU8, Observations
+from vislam.core.messages import Frame, ImageU8, Observations, chosen
 from vislam.core.streams import Happening, Repeats, StreamEvent, StreamJudge
 
 _DESCRIPTOR_BYTES = 32
@@ -76,13 +76,7 @@ class Intake:
         if good.all():
             return given
         self.refused_tracks += int((~good).sum())
-        return Observations(
-            given.track_ids[good],
-            given.pixels_px[good],
-            None if given.right_px is None else given.right_px[good],
-            None if given.depth_m is None else given.depth_m[good],
-            descriptors=None if given.descriptors is None else given.descriptors[good],
-        )
+        return chosen(given, good)
 
 
 class CameraFeed:

@@ -89,7 +89,7 @@ def make_keyframe(
     """
     ids = None
     if frame.tracks is None:
-        pixels, descriptors = describe(frame.images[0], features)
+        pixels, descriptors = describe(frame.images[0], features, mask=frame.mask(0))
     elif frame.tracks.descriptors is not None:
         ids, pixels, descriptors = frame.tracks.track_ids, frame.tracks.pixels_px, frame.tracks.descriptors
     else:

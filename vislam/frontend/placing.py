@@ -59,7 +59,7 @@ class Placer:
         if not frame.images:
             return attempt
         T_found = recognise(
-            keyframe, frame.images[0], view.camera, view.T_body_cam, config.described_features, config.min_inliers
+            keyframe, frame, view.camera, view.T_body_cam, config.described_features, config.min_inliers
         )
         return attempt if T_found is None else self.attempt(frame, T_found, dt_s)
 

@@ -31,7 +31,7 @@ class SecondCamera:
         """Go back to the usual camera as soon as it sees again, if the keyframe has anything in its image."""
         if not self._tracks.view.is_swapped:
             return
-        self._now_sees = sees(whole.images[0], self._config)
+        self._now_sees = sees(whole, 0, self._config)
         if self._now_sees and self._key_sees:
             self._tracks.carry_keyframe(self._views[0], keyframe)
 
@@ -65,4 +65,4 @@ class SecondCamera:
         if self._tracks.view.is_swapped:
             return "cam0 sees again" if self._now_sees else ""
         lost_depth = self._tracks.lacks_depth and min(len(self._views), len(frame.images)) > 1
-        return "cam1 sees again" if lost_depth and sees(frame.images[1], self._config) else ""
+        return "cam1 sees again" if lost_depth and sees(frame, 1, self._config) else ""

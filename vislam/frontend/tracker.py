@@ -30,8 +30,8 @@ MIN_START_CORNERS = 40  # an image with fewer cannot start a keyframe
 MAX_BACK_PX = 1.5
 
 
-FindCorners = Callable[[ImageU8, Array], Array]
-"""Finds new corners: grey image [H, W], pixels [M, 2] of those that are followed -> pixels [N, 2]."""
+FindCorners = Callable[[ImageU8, Array, ImageU8 | None], Array]
+"""Finds new corners: grey image [H, W], pixels [M, 2] of those that are followed, mask [H, W] -> pixels [N, 2]."""
 
 
 class Tracker:
@@ -66,7 +66,7 @@ class Tracker:
         if self._image is None:
             return np.full((len(self), 2), np.nan)
         source = matched(self._image, frame.images[0], self.pixels, guess, self._flow.window_px)
-        return follow(source, frame.images[0], self.pixels, guess, self._flow)[0]
+        return follow(source, frame.images[0], self.pixels, guess, self._flow, frame.mask(0))[0]
 
     def follow_warped(self, frame: Frame, guess: Array, on_plane: Bools, H: Array) -> Array:
         """Return the same where tracks `on_plane` [N] lie on a plane whose homography is about H [3, 3].
@@ -83,7 +83,7 @@ class Tracker:
         at = np.column_stack([self.pixels[on_plane], np.ones(int(on_plane.sum()))]) @ H.T
         source = at[:, :2] / np.where(at[:, 2:] > 0.0, at[:, 2:], np.nan)
         warped = matched(warped, frame.images[0], source, guess[on_plane], self._flow.window_px)
-        found[on_plane] = follow(warped, frame.images[0], source, guess[on_plane], self._flow)[0]
+        found[on_plane] = follow(warped, frame.images[0], source, guess[on_plane], self._flow, frame.mask(0))[0]
         return found
 
     def look_through(self, image: ImageU8, pixels: Array) -> None:
@@ -113,7 +113,7 @@ class Tracker:
         self._keep(kept)
         self.pixels = pixels[kept].copy()
         self._given = frame.tracks is not None
-        ids, fresh = self._detect(frame.images[0]) if frame.tracks is None else self._take(frame.tracks)
+        ids, fresh = self._detect(frame) if frame.tracks is None else self._take(frame.tracks)
         self.ids = np.concatenate([self.ids, ids])
         self.pixels = np.vstack([self.pixels, fresh])
         self.misses = np.zeros(len(self.ids), dtype=np.int64)
@@ -121,15 +121,15 @@ class Tracker:
         self._image = frame.images[0] if frame.images else None
         return len(ids)
 
-    def _detect(self, image: ImageU8) -> tuple[NDArray[np.int64], Array]:
+    def _detect(self, frame: Frame) -> tuple[NDArray[np.int64], Array]:
         """Return ids [M] and pixels [M, 2] of new corners."""
-        config = self._config
+        config, image, mask = self._config, frame.images[0], frame.mask(0)
         if self._find is not None:
-            fresh = self._find(image, self.pixels)
+            fresh = self._find(image, self.pixels, mask)
         else:
             fresh = detect_corners(
                 image, config.max_tracks - len(self.ids), CELL_PX, config.min_distance_px, self.pixels,
-                MIN_CORNER_RESPONSE,
+                MIN_CORNER_RESPONSE, mask,
             )  # fmt: skip
         ids = np.arange(self.next_id, self.next_id + len(fresh), dtype=np.int64)
         self.next_id += len(fresh)

@@ -12,7 +12,7 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert
 from vislam.core.jit import njit
-from vislam.core.messages import Array, Frame, ImageF32, ImageU8, Observations
+from vislam.core.messages import Array, Frame, ImageF32, Observations
 from vislam.frontend.tracker import CELL_PX, MAX_BACK_PX, MIN_CORNER_RESPONSE, MIN_START_CORNERS, given_rows
 from vislam.vision.brightness import matched
 from vislam.vision.features import FlowSettings, detect_corners, follow
@@ -187,7 +187,7 @@ class StereoDepth:
             for start_rho in self._starts(expected_rho):
                 guess = self._right.project(rays + start_rho[:, None] * self._T_right_left[:3, 3])
                 source = matched(left, right, pixels, guess, self._flow.window_px)
-                found, difference = follow(source, right, pixels, guess, self._flow)
+                found, difference = follow(source, right, pixels, guess, self._flow, frame.mask(1))
                 candidate_rho = self._accepted(rays, found)
                 better = np.isfinite(candidate_rho) & (difference < best)
                 right_px[better], rho[better], best[better] = found[better], candidate_rho[better], difference[better]
@@ -250,7 +250,8 @@ class View:
         """Return the frame with this camera's image first; done twice, it is the frame again."""
         if not self.is_swapped or len(frame.images) < 2:
             return frame
-        return replace(frame, images=(frame.images[1], frame.images[0], *frame.images[2:]))
+        masks = (frame.mask(1), frame.mask(0)) if frame.masks else ()
+        return replace(frame, images=(frame.images[1], frame.images[0], *frame.images[2:]), masks=masks)
 
     def carry(self, points: Array, covariances: Array, other: View) -> tuple[Array, Array]:
         """Return inverse-depth points [N, 3] of this camera as another sees them, and their covariances [N, 3, 3]."""
@@ -286,8 +287,9 @@ def spread(covariances: Array) -> Array:
     return np.asarray(np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))
 
 
-def sees(image: ImageU8, config: FrontEndConfig) -> bool:
-    """Return whether an image shows enough to start from: a covered camera's does not."""
-    wanted = MIN_START_CORNERS
-    corners = detect_corners(image, wanted, CELL_PX, config.min_distance_px, np.empty((0, 2)), MIN_CORNER_RESPONSE)
+def sees(frame: Frame, camera: int, config: FrontEndConfig) -> bool:
+    """Return whether a camera's image shows enough to start from: a covered one's does not."""
+    wanted, none = MIN_START_CORNERS, np.empty((0, 2))
+    image, mask = frame.images[camera], frame.mask(camera)
+    corners = detect_corners(image, wanted, CELL_PX, config.min_distance_px, none, MIN_CORNER_RESPONSE, mask)
     return len(corners) >= wanted

@@ -17,7 +17,7 @@ from vislam.core.memory import TagSighting
 from vislam.core.messages import Array, Frame
 from vislam.loop.candidates import Candidate
 from vislam.loop.verification import Verification
-from vislam.vision.features import find_tags
+from vislam.vision.features import are_used, find_tags
 
 _CORNER_SIGMA_PX = 0.5  # 0.1 to 0.6 px measured on rendered tags of 88 down to 30 px
 _MIN_SIDE_PX = 30.0  # smaller tags are read, but their corners are off by more
@@ -31,6 +31,8 @@ def sight_tags(frame: Frame, camera: Camera, config: LoopConfig) -> tuple[TagSig
     ids, corners_px = find_tags(frame.images[0], config.tags, _MIN_SIDE_PX)
     sightings = []
     for tag_id, corners in zip(ids.tolist(), corners_px, strict=True):
+        if (mask := frame.mask(0)) is not None and not are_used(mask, corners).all():
+            continue
         side_px = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
         if side_px < _MIN_SIDE_PX or np.count_nonzero(ids == tag_id) > 1:
             continue

@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from vislam.core.camera import Rig
-from vislam.core.messages import Frame, Keyframe, KeyframePacket, NavState, Tracking, VoMeasurement
+from vislam.core.messages import Frame, Keyframe, KeyframePacket, NavState, Tracking, VoMeasurement, chosen
 
 _PATIENCE_NS = 5_000_000_000  # without sight; until then the camera may find the last keyframe again
 _EVERY_NS = 1_000_000_000  # from then on
@@ -114,12 +114,7 @@ def dark(frame: Frame, t_ns: int) -> Frame:
     """Return a frame like another in which nothing is seen."""
     tracks = frame.tracks
     if tracks is not None:
-        tracks = replace(
-            tracks, track_ids=tracks.track_ids[:0], pixels_px=tracks.pixels_px[:0],
-            right_px=None if tracks.right_px is None else tracks.right_px[:0],
-            depth_m=None if tracks.depth_m is None else tracks.depth_m[:0],
-            descriptors=None if tracks.descriptors is None else tracks.descriptors[:0],
-        )  # fmt: skip
+        tracks = chosen(tracks, np.zeros(len(tracks.track_ids), dtype=np.bool_))
     return Frame(
         t_ns, frame.index, tuple(np.zeros_like(image) for image in frame.images),
         None if frame.color is None else np.zeros_like(frame.color),

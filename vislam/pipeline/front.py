@@ -31,6 +31,7 @@ from vislam.ekf import Hint
 from vislam.ekf.correction import AppliedReading
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.masks import Masks
 from vislam.frontend.result import identity_motion, lost_motion
 from vislam.imu import ImuNoise
 from vislam.pipeline.blind_start import Said
@@ -80,7 +81,7 @@ class Front:
         refuse_without_scale(config.ekf, self.frontend.knows_scale, noise is not None)
         self.camera_clock = CameraClock(config.init)
         self.begun = Start(noise is not None)
-        self.watch = RunWatch(config.init, self.frontend.knows_scale, suite)
+        self.watch = RunWatch(config.init, self.frontend.knows_scale, Masks(config.frontend.masks, rig), suite)
         self._T_upright = _upright(rig)
         most_m = np.inf if rig.is_blind else config.ekf.submap_sigma_m  # no loop would join submaps
         self._chain = KeyframeChain(self._T_upright if noise is None else np.eye(4), most_m)

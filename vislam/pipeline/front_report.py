@@ -20,6 +20,7 @@ from vislam.core.streams import StreamEvent
 from vislam.frontend import TrackResult, knows_scale
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.intake import CameraFeed
+from vislam.frontend.masks import Masks
 from vislam.frontend.pixel_noise import NoiseUsed
 from vislam.frontend.time_offset import TURN_SIGMA
 from vislam.imu import InertialCondition, NoiseRatios
@@ -131,14 +132,14 @@ class RunWatch:
         drives: for each sensor of what drives, whether it turns as the gyroscope has it.
     """
 
-    def __init__(self, config: InitConfig, knows_scale: bool, suite: Suite | None = None) -> None:
+    def __init__(self, config: InitConfig, knows_scale: bool, masks: Masks, suite: Suite | None = None) -> None:
         """Start before the first frame; `knows_scale` is whether vision measures metres, `suite` further sensors."""
         self.counters = {
             "frames_lost": 0, "frames_degraded": 0, "longest_loss_ms": 0, "imu_outages": 0, "frames_at_rest": 0,
             "submaps": 1,
         }  # fmt: skip
         self.feed, self.tracks, self.uniform = CameraFeed(), NoiseUsed(), UniformMotion(config)
-        self._knows_scale, self.drives = knows_scale, turn_witnesses(suite)
+        self._knows_scale, self._masks, self.drives = knows_scale, masks, turn_witnesses(suite)
         self._lost_since_ns: int | None = None
         self._why_lost = Counter[str]()
 
@@ -148,12 +149,14 @@ class RunWatch:
             one.hear(value)
 
     def see(self, frame: Frame) -> Frame:
-        """Take a frame as the camera gave it; return it as it can be used: one that is frozen shows nothing."""
+        """Take a frame as the camera gave it; return it as it can be used, masked; one that is frozen shows nothing."""
         if not frame.images and frame.tracks is None:  # there is no camera
             self.feed.count(frame)
             return frame
         seen = self.feed.add(frame)
-        return replace(dark(frame, frame.t_ns), follows_step=frame.follows_step) if self.feed.is_frozen else seen
+        if self.feed.is_frozen:
+            return replace(dark(frame, frame.t_ns), follows_step=frame.follows_step)
+        return self._masks.onto(seen)
 
     def note(self, track: TrackResult, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
         """Take what became of the frame that `feed` has.
@@ -200,6 +203,7 @@ class RunWatch:
                 "repeated": feed.repeated,
                 "frozen": feed.frozen,
             },
+            **({"masks": dict(self._masks.problems)} if self._masks.problems else {}),
         }
 
 

@@ -22,6 +22,7 @@ from vislam.core.memory import FrontMemory, GraphRecord, KeyframeEntry, SlamMemo
 from vislam.core.messages import Localisation, LoopDecision, Submaps, Tracking
 from vislam.core.progress import Progress, silent
 from vislam.core.recording import Recording
+from vislam.frontend.masks import mask_warnings
 from vislam.imu import ImuNoise
 from vislam.loop import LoopRow, caption
 from vislam.mapping.mapper import Mapper
@@ -254,6 +255,7 @@ class Run:
             self.warnings += [f"no {name}: {reason}" for name, reason in level_map.notes.items()]
         if self.slam.back is not None:
             self.warnings += label_warnings(self.slam.back.counters.get("map", {}))
+        self.warnings += mask_warnings(self.slam.front.report().counters.get("masks", {}))
         show_paths(self.viewer, final, truth, self.slam.front.report().alignment)
         is_level = self.slam.front.start is not None
         if mapper is not None and len(self.log):

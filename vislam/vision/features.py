@@ -25,6 +25,7 @@ Words = NDArray[np.uint64]
 _BORDER_PX = 12  # corners nearer to the border lose half of their window as soon as the camera moves
 _ORB_BORDER_PX = 31  # ORB's patch; OpenCV drops keypoints nearer to the border
 _AT_ONCE_PX = 8  # columns of a window that OpenCV's Lucas-Kanade takes at once; the rest costs as much one by one
+LEAST_USED = 128  # in a mask: a pixel of less is not used
 _NO_INDICES = np.empty((0, 2), dtype=np.int64)
 
 
@@ -44,8 +45,9 @@ class FlowSettings:
 
 
 def detect_corners(
-    image: ImageU8, count: int, cell_px: int, min_distance_px: float, live: Array, quality: float
-) -> Array:
+    image: ImageU8, count: int, cell_px: int, min_distance_px: float, live: Array, quality: float,
+    mask: ImageU8 | None = None,
+) -> Array:  # fmt: skip
     """Find new corners where the image is not yet covered.
 
     Args:
@@ -55,6 +57,7 @@ def detect_corners(
         min_distance_px: from every live corner and from each other.
         live: pixels [M, 2] of corners that are already followed; NaN rows are ignored.
         quality: least response, as the smaller eigenvalue of the mean gradient matrix in (grey levels / px)^2.
+        mask: [H, W], see `Frame.masks`.
 
     Returns:
         Pixels [N, 2], N <= count, in order of choice.
@@ -66,6 +69,8 @@ def detect_corners(
     # OpenCV scales the eigenvalue of 8-bit images: Sobel 3 has gain 8 per grey level and px, then 1 / (4 * 5 * 255)
     scale = (8.0 / (4.0 * 5.0 * 255.0)) ** 2 * 25.0
     peaks &= response > quality * scale
+    if mask is not None:
+        peaks &= mask >= LEAST_USED
     peaks[:_BORDER_PX], peaks[-_BORDER_PX:], peaks[:, :_BORDER_PX], peaks[:, -_BORDER_PX:] = False, False, False, False
     rows, columns = np.nonzero(peaks)
     strengths = response[rows, columns]
@@ -77,7 +82,9 @@ def detect_corners(
     return candidates[order][chosen]
 
 
-def detect_harris(image: ImageU8, boxes: Array, count: int, min_distance_px: float, live: Array) -> Array:
+def detect_harris(
+    image: ImageU8, boxes: Array, count: int, min_distance_px: float, live: Array, used: ImageU8 | None = None
+) -> Array:
     """Find new Harris corners (Harris and Stephens, AVC 1988), box by box.
 
     Args:
@@ -86,6 +93,7 @@ def detect_harris(image: ImageU8, boxes: Array, count: int, min_distance_px: flo
         count: of corners in each box, those that are followed included.
         min_distance_px: from every live corner and from each other.
         live: pixels [M, 2] of corners that are already followed.
+        used: a mask [H, W], see `Frame.masks`.
 
     Returns:
         Pixels [N, 2], box by box, strongest first.
@@ -97,6 +105,8 @@ def detect_harris(image: ImageU8, boxes: Array, count: int, min_distance_px: flo
         if wanted <= 0 or right - left < _BORDER_PX or bottom - top < _BORDER_PX:
             continue
         mask = np.full((bottom - top, right - left), 255, dtype=np.uint8)
+        if used is not None:
+            mask[used[top:bottom, left:right] < LEAST_USED] = 0
         for x, y in live[inside]:
             cv2.circle(mask, (round(x) - left, round(y) - top), round(min_distance_px), 0, -1)
         corners = cv2.goodFeaturesToTrack(
@@ -167,13 +177,14 @@ def _choose_apart(points: Array, live: Array, count: int, distance: float, width
 
 
 def follow(
-    source: ImageU8, target: ImageU8, pixels: Array, guess: Array, settings: FlowSettings
+    source: ImageU8, target: ImageU8, pixels: Array, guess: Array, settings: FlowSettings, mask: ImageU8 | None = None
 ) -> tuple[Array, Array]:
     """Follow corners [N, 2] of `source` into `target`, starting at `guess` [N, 2] (NaN: not tried).
 
     Returns:
         Pixels [N, 2] in target and the mean grey difference [N] of the windows. Both are NaN where the corner was lost:
-        outside the image, or not back at its start within `max_back_px` when followed the other way.
+        outside the image or what its `mask` [H, W] lets be used, or not back at its start within `max_back_px` when
+        followed the other way.
     """
     found, difference = np.full(pixels.shape, np.nan), np.full(len(pixels), np.nan)
     tried = np.flatnonzero(np.isfinite(pixels).all(axis=1) & _near(guess, target))
@@ -187,9 +198,17 @@ def follow(
     good = seen & seen_back & (np.linalg.norm(back - start, axis=1) <= settings.max_back_px)
     height, width = target.shape
     good &= (there[:, 0] >= 0.0) & (there[:, 0] <= width - 1) & (there[:, 1] >= 0.0) & (there[:, 1] <= height - 1)
+    if mask is not None:
+        good[good] = are_used(mask, there[good])
     found[tried[good]] = there[good]
     difference[tried[good]] = error[good]
     return found, difference
+
+
+def are_used(mask: ImageU8, pixels: NDArray[np.floating]) -> Bools:
+    """Return which pixels [N, 2] of an image a mask [H, W] lets be used, see `Frame.masks`."""
+    rows, columns = np.clip(np.rint(pixels[:, ::-1]).astype(np.int64), 0, np.array(mask.shape) - 1).T
+    return np.asarray(mask[rows, columns] >= LEAST_USED)
 
 
 def _near(pixels: Array, image: ImageU8) -> Bools:
@@ -218,9 +237,9 @@ def _flow(
 
 
 def describe(
-    image: ImageU8, count: int = 1000, cell_px: int = 40, fast_threshold: int = 10
+    image: ImageU8, count: int = 1000, cell_px: int = 40, fast_threshold: int = 10, mask: ImageU8 | None = None
 ) -> tuple[Array, Descriptors]:
-    """Find and describe ORB keypoints spread over a grey image [H, W].
+    """Find and describe ORB keypoints spread over a grey image [H, W], or what its mask [H, W] lets be used of it.
 
     Three times too many are detected over eight octaves and served cell by cell, so that one rich corner of the image
     does not take them all.
@@ -229,7 +248,7 @@ def describe(
         Pixels [N, 2] and descriptors [N, 32], N <= count; both empty for an image without features.
     """
     orb = cv2.ORB.create(3 * count, fastThreshold=fast_threshold, edgeThreshold=_ORB_BORDER_PX)
-    keypoints = orb.detect(image, None)
+    keypoints = orb.detect(image, None if mask is None else np.where(mask >= LEAST_USED, mask, np.uint8(0)))
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
     pixels = _places(keypoints)

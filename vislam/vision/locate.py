@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, transform, transform_points
-from vislam.core.messages import Array, ImageU8, Keyframe
+from vislam.core.messages import Array, Frame, Keyframe
 from vislam.vision.features import describe, match
 
 _LEAST_POINTS = 4
@@ -52,12 +52,12 @@ def pnp_ransac(points_key_m: Array, xy: Array, threshold: float, min_inliers: in
 
 
 def recognise(
-    keyframe: Keyframe, image: ImageU8, camera: Camera, T_body_cam: Array, features: int, min_inliers: int
+    keyframe: Keyframe, frame: Frame, camera: Camera, T_body_cam: Array, features: int, min_inliers: int
 ) -> Array | None:
-    """Return T_key_cam [4, 4] of an image in which the keyframe's described points are recognised, or None."""
+    """Return T_key_cam [4, 4] of a frame in which the keyframe's described points are recognised, or None."""
     if keyframe.points_body_m is None:
         return None
-    pixels, descriptors = describe(image, features)
+    pixels, descriptors = describe(frame.images[0], features, mask=frame.mask(0))
     pairs = match(keyframe.descriptors, descriptors)
     points = transform_points(np.asarray(invert(T_body_cam)), keyframe.points_body_m[pairs[:, 0]])
     return pnp_ransac(points, camera.normalise(pixels[pairs[:, 1]]), 4.0 / camera.fx, min_inliers)

@@ -192,17 +192,18 @@ class Regions:
         self.above = _grid(0.0, 0.0, float(camera.width), max(self.horizon_px - _HORIZON_PX, 0.0), 1)
 
     def shi_tomasi(
-        self, image: ImageU8, live: Array, count: int, cell_px: int, distance_px: float, least: float
-    ) -> Array:
+        self, image: ImageU8, live: Array, count: int, cell_px: int, distance_px: float, least: float,
+        mask: ImageU8 | None,
+    ) -> Array:  # fmt: skip
         """Find corners over the whole image whose response stands out from the image's own noise."""
         noise = min(noise_grey(image), _MAX_NOISE_GREY)
         least = max(least, _TEXTURE_RATIO * _NOISE_RESPONSE * noise * noise)
-        return detect_corners(image, count, cell_px, distance_px, live, least)
+        return detect_corners(image, count, cell_px, distance_px, live, least, mask)
 
-    def harris(self, image: ImageU8, live: Array, distance_px: float) -> Array:
+    def harris(self, image: ImageU8, live: Array, distance_px: float, mask: ImageU8 | None) -> Array:
         """Find corners region by region, as many in each."""
         boxes = np.vstack([self.floor, self.above])
-        return detect_harris(image, boxes, self._config.max_tracks // len(boxes), distance_px, live)
+        return detect_harris(image, boxes, self._config.max_tracks // len(boxes), distance_px, live, mask)
 
     def counts(self, pixels: Array) -> NDArray[np.int64]:
         """Return how many pixels [N, 2] lie in each of the eight regions of the floor [8]."""

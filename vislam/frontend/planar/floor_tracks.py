@@ -135,12 +135,12 @@ class FloorTracks:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(close & (rho > 1.0 / self._config.max_depth_m), 1.0 / rho, np.nan)
 
-    def _find(self, image: ImageU8, live: Array) -> Array:
-        config = self._config
+    def _find(self, image: ImageU8, live: Array, mask: ImageU8 | None) -> Array:
+        apart_px = self._config.min_distance_px
         if self._is_split:
-            return self._regions.harris(image, live, config.min_distance_px)
+            return self._regions.harris(image, live, apart_px, mask)
         wanted = self._planar.max_tracks - len(live)
-        return self._regions.shi_tomasi(image, live, wanted, CELL_PX, config.min_distance_px, MIN_CORNER_RESPONSE)
+        return self._regions.shi_tomasi(image, live, wanted, CELL_PX, apart_px, MIN_CORNER_RESPONSE, mask)
 
     def _add_landmarks(self, count: int, R_level_cam: Array) -> None:
         """Give the tracker's last `count` corners landmarks: under the horizon on the floor, as a guess."""
@@ -180,7 +180,7 @@ class Steps:
         if self._image is None or not frame.images:
             return np.full_like(self._pixels, np.nan)
         source = matched(self._image, frame.images[0], self._pixels, self._pixels, self._flow.window_px)
-        self._pixels = follow(source, frame.images[0], self._pixels, self._pixels, self._flow)[0]
+        self._pixels = follow(source, frame.images[0], self._pixels, self._pixels, self._flow, frame.mask(0))[0]
         self._image = frame.images[0]
         return self._pixels
 

@@ -322,7 +322,7 @@ def light(step: FrontStep, shows: bool, feeds_depth: bool = False) -> FrontStep:
     With pictures only if it `shows` them, or `feeds_depth` from one camera.
     """
     frame, track = step.frame, step.track
-    bare = replace(frame, images=(), color=None, depth_m=None, tracks=None)
+    bare = replace(frame, images=(), color=None, depth_m=None, tracks=None, masks=())
     if feeds_depth and seen_between(step):
         bare = replace(bare, images=frame.images[:1])
     keyframe = track.keyframe
@@ -330,5 +330,5 @@ def light(step: FrontStep, shows: bool, feeds_depth: bool = False) -> FrontStep:
         keyframe = Keyframe(keyframe.id, keyframe.t_ns, bare, np.empty((0, 2)), np.empty((0, 32), np.uint8), None)
     observations = track.observations if shows else no_observations()
     track = replace(track, keyframe=keyframe, observations=observations)
-    shown = replace(frame, depth_m=None, tracks=None) if shows else bare
+    shown = replace(frame, depth_m=None, tracks=None, masks=()) if shows else bare
     return replace(step, frame=shown, track=track, keyframes=[], corrections=[])

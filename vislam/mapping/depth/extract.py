@@ -90,6 +90,8 @@ class ScanExtractor:
             for camera, picture in zip(self._cameras, frame.images, strict=False):
                 camera.check_image(picture)
             depth_m, grey = self._stereo.match(frame.images[0], frame.images[1])
+            if (mask := frame.mask(0)) is not None:
+                depth_m = np.where(self._stereo.uses(mask), depth_m, np.float32(0.0))
             return Scan(filter_depth(depth_m, 1, self.view, self._config), None, _rgb(grey))
         if frame.depth_m is None or self._one_camera:
             return None

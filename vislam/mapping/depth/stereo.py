@@ -14,6 +14,7 @@ from vislam.config import MapConfig
 from vislam.core.camera import Rig, rectify
 from vislam.core.messages import ImageU8
 from vislam.mapping.depth.image import DepthView, stereo_view
+from vislam.vision.features import LEAST_USED
 
 _BLOCK_PX = 5
 _SUBPIXELS = 16  # OpenCV's fixed-point disparity
@@ -41,6 +42,11 @@ class DenseStereo:
             speckleWindowSize=0,  # filter_depth does it, for every kind of depth
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
+
+    def uses(self, mask: ImageU8) -> NDArray[np.bool_]:
+        """Return which pixels [h, w] of the rectified left view a mask [H, W] of the left image lets be used."""
+        small = cv2.resize(mask, self._rectification.size, interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.remap(small, *self._rectification.maps0, cv2.INTER_LINEAR)) >= LEAST_USED
 
     def match(self, left: ImageU8, right: ImageU8) -> tuple[NDArray[np.float32], ImageU8]:
         """Return z-depth [h, w] in metres, 0 where not matched, and the rectified left image [h, w]."""

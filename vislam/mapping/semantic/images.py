@@ -5,30 +5,21 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping
-from decimal import Decimal
 from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.camera import Camera, Rig
-from vislam.core.encoded_image import decoded
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame
-from vislam.core.reading import read_bytes
+from vislam.core.stamped_images import StampedFiles, read_grey_png
 from vislam.mapping.depth.image import DepthView
 from vislam.mapping.semantic.classes import FILE_NAME, UNLABELLED, LabelClasses
 
 Labels = NDArray[np.uint16]
 
-_TOLERANCE_NS = 1_000_000  # between an image's stamp and that in the name of its labels
-_MAX_BYTES = 2**26  # of one label image
-_MAX_FILES = 2_000_000
-_MAX_DIGITS = 19  # of a stamp in nanoseconds
-_PNG_HEAD = b"\x89PNG\r\n\x1a\n"
-_GREY = 0  # colour type of a PNG
 _MISSING = "keyframes without a label image"
 _REFUSED = "label images that cannot be used"
 _UNKNOWN = "label images with ids that have no name"
@@ -60,32 +51,14 @@ class LabelFolder:
         self.problems: Counter[str] = Counter()
         self._camera = camera
         self._known = self.classes.known
-        stamps: dict[int, Path] = {}
-        try:
-            for path in sorted(folder.iterdir()):
-                stamp_ns = _stamp_ns(path.stem) if path.suffix == ".png" else None
-                if stamp_ns is not None:
-                    stamps[stamp_ns] = path
-                if len(stamps) > _MAX_FILES:
-                    raise DataError(f"{folder} has more than {_MAX_FILES} label images; give those of this recording")
-        except OSError as error:
-            raise DataError(f"{folder} cannot be listed: {error.strerror}") from error
-        if not stamps:
-            raise DataError(
-                f"{folder} has no label images; name them by the stamps of the colour images, such as "
-                "1403636579763555584.png (nanoseconds) or 1305031452.791720.png (seconds)"
-            )
-        self._t_ns = np.array(sorted(stamps), dtype=np.int64)
-        self._paths = [stamps[t_ns] for t_ns in self._t_ns.tolist()]
+        self._files = StampedFiles(folder, "label images")
 
     def __call__(self, frame: Frame | None, camera_t_ns: int) -> Labels | None:
         """Return the labels [h, w] of the image with a stamp; None where there are none that can be used."""
-        i = int(np.searchsorted(self._t_ns, camera_t_ns))
-        nearest = min((k for k in (i - 1, i) if 0 <= k < len(self._t_ns)), key=lambda k: self._apart_ns(k, camera_t_ns))
-        if self._apart_ns(nearest, camera_t_ns) > _TOLERANCE_NS:
+        path = self._files.at(camera_t_ns)
+        if path is None:
             self._count(_MISSING, f"the one at {camera_t_ns} ns is the first")
             return None
-        path = self._paths[nearest]
         try:
             labels = checked(read_labels(path, self._camera), self._camera)
         except DataError as error:
@@ -96,9 +69,6 @@ class LabelFolder:
             self._count(_UNKNOWN, f"{path} has {labels[unknown][0]}; name it in {FILE_NAME}")
             labels = np.where(unknown, np.uint16(UNLABELLED), labels)
         return labels
-
-    def _apart_ns(self, k: int, t_ns: int) -> int:
-        return abs(int(self._t_ns[k]) - t_ns)
 
     def _count(self, kind: str, what: str) -> None:
         if kind not in self.problems:
@@ -158,25 +128,9 @@ def checked(labels: NDArray[np.generic], camera: Camera) -> Labels:
 def read_labels(path: Path, camera: Camera) -> Labels:
     """Return the ids [h, w] in a grey PNG of 8 or 16 bits.
 
-    Raises DataError when it is something else, cut, or not of the size of the camera's images or a whole fraction of
-    it; the size is compared before anything is decoded.
+    Raises DataError as `read_grey_png` does, also unless the size is that of the camera's images or a whole fraction.
     """
-    try:
-        data = read_bytes(path, _MAX_BYTES)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    if not data.startswith(_PNG_HEAD) or len(data) < 26 or data[12:16] != b"IHDR":
-        raise DataError(f"{path} is no PNG; ids must be stored without loss")
-    bits, kind = data[24], data[25]
-    if kind != _GREY or bits not in (8, 16):
-        raise DataError(f"{path} is no grey PNG of 8 or 16 bits: store the ids themselves, not colours or a palette")
-    try:
-        _check_size((int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")), camera)
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
-    image = decoded(data, cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2 or b"IEND" not in data[-1024:]:
-        raise DataError(f"{path} is damaged or cut")
+    image = read_grey_png(path, (8, 16), lambda width, height: _check_size((width, height), camera))
     return np.asarray(image, dtype=np.uint16)
 
 
@@ -188,16 +142,3 @@ def _check_size(size: tuple[int, int], camera: Camera) -> None:
             f"labels are {width}x{height}, the camera's images {camera.width}x{camera.height}; "
             "they must be as large, or smaller by a whole factor"
         )
-
-
-def _stamp_ns(stem: str) -> int | None:
-    """Return the stamp that a name states: whole nanoseconds, or seconds with a decimal point."""
-    whole, point, part = stem.partition(".")
-    if not (stem.isascii() and whole.isdecimal() and len(whole) <= _MAX_DIGITS):
-        return None
-    if not point:
-        return int(whole) if int(whole) < 2**63 else None
-    if not (part.isdecimal() and len(part) <= _MAX_DIGITS) or len(whole) > 10:
-        return None
-    stamp_ns = round(Decimal(stem) * 1_000_000_000)
-    return stamp_ns if stamp_ns < 2**63 else None

@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert
-from vislam.core.messages import Array, ImageF32
+from vislam.core.messages import Array, ImageF32, ImageU8
 
 PERSON_M = 2.0  # away from the camera
 _SWEEP_S = 7.0  # of the person, to the other side and back
@@ -73,11 +73,23 @@ class Disturbance:
         options = self._options
         if in_window(t_s, options.blank_begin_s, options.blank_length_s, options.blank_every_s):
             return np.full_like(light, _BLANK), np.zeros_like(depth_m)
-        if options.moving_share > 0.0 and in_window(t_s, options.moving_begin_s, options.moving_length_s):
-            return self._with_person(camera, t_s, light, depth_m)
-        return light, depth_m
+        seen = self._person(camera, t_s)
+        if seen is None:
+            return light, depth_m
+        drawn, cover = seen
+        spoilt = drawn + (1.0 - cover[..., None]) * light
+        return np.asarray(spoilt, np.float32), np.where(cover > 0.5, np.float32(PERSON_M), depth_m)
 
-    def _with_person(self, camera: int, t_s: float, light: ImageF32, depth_m: ImageF32) -> tuple[ImageF32, ImageF32]:
+    def mask(self, camera: int, t_s: float) -> ImageU8 | None:
+        """Return 0 where a camera's image shows the person, and 255 elsewhere [H, W]; None without one."""
+        seen = self._person(camera, t_s)
+        return None if seen is None else np.where(seen[1] > 0.0, np.uint8(0), np.uint8(255))
+
+    def _person(self, camera: int, t_s: float) -> tuple[ImageF32, ImageF32] | None:
+        """Return display values [H, W, 3] of the person, and how much of each pixel it is [H, W]; None without one."""
+        options = self._options
+        if options.moving_share <= 0.0 or not in_window(t_s, options.moving_begin_s, options.moving_length_s):
+            return None
         box = person_box(self._rig.cameras[0], self._options.moving_share, t_s)
         middle = box[0]
         if camera > 0:
@@ -86,13 +98,11 @@ class Disturbance:
             middle = self._rig.cameras[camera].project(point @ T_camera_cam0[:3, :3].T + T_camera_cam0[:3, 3])[0]
         corner = middle - box[1]
         shift = np.array([[1.0, 0.0, corner[0]], [0.0, 1.0, corner[1]]])
-        size = (light.shape[1], light.shape[0])
+        size = (self._rig.cameras[camera].width, self._rig.cameras[camera].height)
         drawn = cv2.warpAffine(self._cloth, shift, size, flags=cv2.INTER_LINEAR)
         body = np.ones(self._cloth.shape[:2], dtype=np.float32)
         cover = cv2.warpAffine(body, shift, size, flags=cv2.INTER_LINEAR)
-        there = cover[..., None]
-        spoilt = drawn + (1.0 - there) * light
-        return np.asarray(spoilt, np.float32), np.where(cover > 0.5, np.float32(PERSON_M), depth_m)
+        return np.asarray(drawn, np.float32), np.asarray(cover, np.float32)
 
 
 def _cloth(camera: Camera, share: float, rng: np.random.Generator) -> ImageF32:

@@ -62,6 +62,7 @@ class SimOptions:
     moving_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the image: filled by a person walking to and fro
     moving_begin_s: Annotated[float, Field(ge=0.0)] = 0.0
     moving_length_s: Annotated[float, Field(ge=0.0)] | None = None  # None: to the end
+    moving_masks: bool = False  # frames have masks that leave the person out
     gravity_m_s2: float = 9.81
     world_seed: int = 0  # of the place: its textures and where things stand; `seed` is that of motion and sensors
     workers: Annotated[int, Field(ge=1, le=16)] = 1  # threads that render ahead
@@ -199,22 +200,24 @@ class Simulation:
         UsageError for an index that does not exist.
         """
         self._check_index(index)
-        t_s = float(self._frame_s[index])
+        t_s, since_s = float(self._frame_s[index]), float(self._frame_s[index] - self._frame_s[0])
         images: list[ImageU8] = []
         color: ImageU8 | None = None
         depth: ImageF32 | None = None
         for camera, renderer in enumerate(self._renderers):
             rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(1, camera, index)))
             light, exact = self._see(renderer, self.rig.T_body_cams[camera], t_s)
-            light, exact = self._disturbance.spoil(camera, t_s - float(self._frame_s[0]), light, exact)
-            gain = float(self._gains[index]) * self._disturbance.gain(t_s - float(self._frame_s[0]))
+            light, exact = self._disturbance.spoil(camera, since_s, light, exact)
+            gain = float(self._gains[index]) * self._disturbance.gain(since_s)
             picture = self._imager.sense(light, gain, rng)
             images.append(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             if camera == 0:
                 color = picture
                 if self.rig.has_depth:
                     depth = sense_depth(exact, DepthNoise(), rng) if self.options.depth_noise else exact
-        return Frame(int(self._stamp_ns[index]), index, tuple(images), color, depth)
+        count = len(images) if self.options.moving_masks else 0
+        masks = tuple(self._disturbance.mask(camera, since_s) for camera in range(count))
+        return Frame(int(self._stamp_ns[index]), index, tuple(images), color, depth, masks=masks)
 
     def labels(self, index: int) -> tuple[int, ImageU8]:
         """Return the stamp of frame `index`, and what its first image shows [H, W]; see `Renderer.labels`.

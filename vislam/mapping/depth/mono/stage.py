@@ -16,6 +16,7 @@ from vislam.mapping.depth.image import mono_camera
 from vislam.mapping.depth.mono.depth_filter import DepthFilter
 from vislam.mapping.depth.mono.prior import flat_prior, points_prior
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
+from vislam.vision.features import LEAST_USED
 
 _FRAMES_PER_KEYFRAME = 6  # used between two keyframes, the newer one included; bounds the time
 _MIN_OVERLAP = 0.5  # of the image that later ones must still see; less, and the next is begun at once
@@ -118,6 +119,9 @@ class MonoDepth:
         frame = packet.keyframe.frame
         grey = self._seen_ideally(frame.images[0])
         image = grey if frame.color is None else self._seen_ideally(frame.color)
+        if (mask := frame.mask(0)) is not None:
+            rho, sigma = prior or flat_prior(grey.shape, self._config)
+            prior = np.where(self._seen_ideally(mask) >= LEAST_USED, rho, np.float32(0.0)), sigma
         self._reference = _Reference(
             packet.keyframe.id, packet.keyframe.t_ns, image, DepthFilter(grey, self._K, self._config, prior), 0
         )
