@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.imu_noise import ImuNoise
-from vislam.core.messages import Frame, ImuSample, MagSample
+from vislam.core.messages import Frame, ImageU8, ImuSample, MagSample
 from vislam.core.streams import StreamJudge
 from vislam.core.trajectory import Trajectory
 
@@ -60,6 +61,24 @@ class WrappedRecording:
     def truth(self) -> Trajectory | None:
         """Return the recording's truth."""
         return self._recording.truth()
+
+
+Masker = Callable[[Frame], Sequence[ImageU8 | None]]
+"""Gives the masks [H, W] of a frame's images, as a network does; see `Frame.masks`."""
+
+
+class MaskedRecording(WrappedRecording):
+    """A recording whose frames have the masks that a function gives each."""
+
+    def __init__(self, recording: Recording, masker: Masker) -> None:
+        """Wrap a recording."""
+        super().__init__(recording)
+        self._masker = masker
+
+    def events(self, from_ns: int | None = None) -> Iterator[ImuSample | MagSample | Frame]:
+        """Yield the recording's values."""
+        for value in self._recording.events(from_ns):
+            yield replace(value, masks=tuple(self._masker(value))) if isinstance(value, Frame) else value
 
 
 class Problems(dict[str, int]):

@@ -14,7 +14,6 @@ from vislam.core.encoded_image import decoded
 from vislam.core.errors import DataError
 from vislam.core.reading import read_bytes
 
-_TOLERANCE_NS = 1_000_000  # between an image's stamp and that in a name
 _MAX_BYTES = 2**26  # of one file
 _MAX_FILES = 2_000_000
 _MAX_DIGITS = 19  # of a stamp in nanoseconds
@@ -45,12 +44,12 @@ class StampedFiles:
         self._t_ns = np.array(sorted(stamps), dtype=np.int64)
         self.paths = [stamps[t_ns] for t_ns in self._t_ns.tolist()]
 
-    def at(self, t_ns: int) -> Path | None:
-        """Return the file of the image with a stamp; None where there is none within a millisecond."""
+    def at(self, t_ns: int, tolerance_ns: int) -> Path | None:
+        """Return the file of the image with a stamp; None where there is none within a tolerance."""
         i = int(np.searchsorted(self._t_ns, t_ns))
         near = (k for k in (i - 1, i) if 0 <= k < len(self._t_ns))
         apart_ns, nearest = min((abs(int(self._t_ns[k]) - t_ns), k) for k in near)
-        return self.paths[nearest] if apart_ns <= _TOLERANCE_NS else None
+        return self.paths[nearest] if apart_ns <= tolerance_ns else None
 
 
 def read_grey_png(path: Path, bits: tuple[int, int], check_size: Callable[[int, int], None]) -> NDArray[np.generic]:

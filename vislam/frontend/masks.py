@@ -19,6 +19,7 @@ from vislam.vision.features import LEAST_USED, are_used
 
 _MARGIN_PX = 8  # not used around what is masked: half a window of Lucas-Kanade, and what masks and depth are late
 _AROUND = np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8)
+_TOLERANCE_NS = 2_000_000  # between an image's stamp and that in a name, as between the images of a pair
 _MISSING = "images without a mask of their own"
 _REFUSED = "masks that cannot be used"
 _COVERED = "images that a mask leaves nothing of"
@@ -43,8 +44,8 @@ class Masks:
         for k, camera in enumerate(rig.cameras):
             whole, parts = Path(folder, f"cam{k}.png"), Path(folder, f"cam{k}")
             if whole.exists():
-                self._whole[k] = _without_margin(_read(whole, camera))
-                if not self._whole[k].any():
+                self._whole[k] = _read(whole, camera)
+                if not _without_margin(self._whole[k]).any():
                     raise DataError(f"{whole}: {_NOTHING}")
             if parts.exists():
                 self._stamped[k] = StampedFiles(parts, "masks")
@@ -55,15 +56,27 @@ class Masks:
                 "images of cam0) or cam0/STAMP.png (for the one with that stamp)"
             )
 
+    def examine(self) -> None:
+        """Read all files, and count in `problems` those that cannot be used, or leave nothing of an image."""
+        for k, files in self._stamped.items():
+            for path in files.paths:
+                mask = self._usable(path, self._cameras[k])
+                if mask is not None and not _without_margin(mask).any():
+                    self._count(_COVERED, f"{path} is the first; {_NOTHING}")
+
     def onto(self, frame: Frame) -> Frame:
         """Return a frame, stamped by the camera's own clock, with 255 in its masks for what is used and 0 for the rest.
 
-        The masks are those it brings and those in files, grown by a margin; depth and given tracks within are left out.
-        Raises DataError when a mask that it brings has not the size of its image.
+        The masks are those it brings and those in files, with a margin around what they hide; depth and given tracks
+        there are left out. Raises DataError when a mask that it brings is not 8 bits and of the size of its image.
         """
-        masks = tuple(self._of(k, camera, frame) for k, camera in enumerate(self._cameras))
-        if all(mask is None for mask in masks):
+        hidden = [self._of(k, camera, frame) for k, camera in enumerate(self._cameras)]
+        if all(mask is None for mask in hidden):
             return frame
+        masks = tuple(None if mask is None else _without_margin(mask) for mask in hidden)
+        for k, mask in enumerate(masks):
+            if mask is not None and not mask.any():
+                self._count(_COVERED, f"cam{k} at {frame.t_ns} ns is the first; {_NOTHING}")
         first, depth_m, tracks = masks[0], frame.depth_m, frame.tracks
         if first is not None and depth_m is not None:
             depth_m = np.where(first > 0, depth_m, np.float32(0.0))
@@ -77,21 +90,19 @@ class Masks:
             if mask.shape != (camera.height, camera.width) or mask.dtype != np.uint8:
                 size = "x".join(map(str, mask.shape[::-1]))
                 raise DataError(f"mask of cam{k} in frame {frame.index} is {mask.dtype} {size}, {_other_size(camera)}")
-        used = [_without_margin(mask) for mask in given] + ([self._whole[k]] if k in self._whole else [])
-        if not used:
-            return None
-        joined = np.asarray(np.minimum.reduce(used), np.uint8)
-        if given and not joined.any():
-            self._count(_COVERED, f"cam{k} at {frame.t_ns} ns is the first; {_NOTHING}")
-        return joined
+        masks = [*given, self._whole[k]] if k in self._whole else given
+        return np.asarray(np.minimum.reduce(masks), np.uint8) if masks else None
 
     def _of_file(self, k: int, camera: Camera, t_ns: int) -> ImageU8 | None:
         if k not in self._stamped:
             return None
-        path = self._stamped[k].at(t_ns)
+        path = self._stamped[k].at(t_ns, _TOLERANCE_NS)
         if path is None:
             self._count(_MISSING, f"that of cam{k} at {t_ns} ns is the first")
             return None
+        return self._usable(path, camera)
+
+    def _usable(self, path: Path, camera: Camera) -> ImageU8 | None:
         try:
             return _read(path, camera)
         except DataError as error:

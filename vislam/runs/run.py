@@ -11,13 +11,13 @@ from vislam.config import Config, load
 from vislam.core.errors import VislamError
 from vislam.core.log import log_to
 from vislam.core.progress import Progress, silent
-from vislam.core.recording import Recording
+from vislam.core.recording import MaskedRecording, Masker, Recording
 from vislam.core.up import parse_up
 from vislam.datasets.calibrated import with_clock
 from vislam.pipeline.settings import derived
 from vislam.runs.begin import execute
 from vislam.runs.drive import imu_noise
-from vislam.runs.folder import map_choice, prepare
+from vislam.runs.folder import MapChoice, map_choice, prepare
 from vislam.runs.loaded import LoadedRun, load_run
 from vislam.runs.sources import open_source
 
@@ -26,7 +26,8 @@ Show = Callable[[str], AbstractContextManager[Progress]]  # of the recording's n
 
 def run(
     source: str, *, out: Path | str, config: Config | Path | str | None = None, overwrite: bool = False,
-    in_map: Path | str | None = None, localize_only: bool = False, progress: Progress = silent, **settings: Any,
+    in_map: Path | str | None = None, localize_only: bool = False, masks: Masker | None = None,
+    progress: Progress = silent, **settings: Any,
 ) -> LoadedRun:  # fmt: skip
     """Run a recording or simulated world into a new folder, as `vislam run` does, and return what it left.
 
@@ -39,6 +40,7 @@ def run(
         overwrite: replace the run that the folder holds.
         in_map: session or folder of an earlier run in whose map this one begins; it is not written.
         localize_only: with `in_map`, leave its keyframes and clouds as they are.
+        masks: gives the masks of each frame's images, which say what not to use (see `Frame.masks`), as a network does.
         progress: called with frames done, frames in all and a short note.
         settings: by section, as docs/config.md has them, or by dotted name (`**{"graph.coupling": "tight"}`); they go
             before `config`.
@@ -46,22 +48,22 @@ def run(
     Raises a VislamError with the next step: UsageError for what cannot be asked, DataError for a bad recording.
     """
     out = Path(out)
-    base = Path(config) if isinstance(config, str) else config
+    chosen = load(Path(config) if isinstance(config, str) else config, settings)
     run_source(
-        source, load(base, settings), out, [f"vislam.run({source!r}, out={str(out)!r})"],
-        overwrite=overwrite, base=None if in_map is None else Path(in_map), localize_only=localize_only,
-        show=lambda _: nullcontext(progress),
+        source, chosen, out, [f"vislam.run({source!r}, out={str(out)!r})"], overwrite=overwrite,
+        choice=map_choice(None if in_map is None else Path(in_map), localize_only, chosen),
+        show=lambda _: nullcontext(progress), masks=masks,
     )  # fmt: skip
     return load_run(out)
 
 
 def run_source(
-    source: str, config: Config, out: Path, command: list[str], *, overwrite: bool, base: Path | None,
-    localize_only: bool, show: Show,
+    source: str, config: Config, out: Path, command: list[str], *, overwrite: bool, choice: MapChoice | None,
+    show: Show, masks: Masker | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run a source into a folder and write its report, whatever happened on the way; return the metrics."""
-    choice = map_choice(base, localize_only, config)
     config, recording = _opened(source, config)
+    recording = recording if masks is None else MaskedRecording(recording, masks)
     prepare(out, overwrite, choice)
     with written_up(out, command), show(recording.name) as progress:
         return execute(recording, config, out, source, command, progress, choice)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -38,6 +38,8 @@ class DoctorOptions:
     """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that nobody names are not opened"""
     camera: str | None = None
     """This camera must give images: its index or device file, picam, realsense, oak"""
+    masks: str | None = None
+    """Folder of masks to examine with the recording, as --frontend.masks of `run`"""
     seconds: Annotated[float, Range(0.5, 60.0)] = 3.0
     """How long each is measured; stand still"""
     sensors: Annotated[SensorsConfig, tyro.conf.arg(name="")] = field(default_factory=SensorsConfig)
@@ -63,6 +65,8 @@ def _examine_recording(options: DoctorOptions) -> int:
 
     with progress_bar("examined", "images") as bar:
         inspection = inspect(options.source, bar)
+    if options.masks is not None:
+        inspection = replace(inspection, findings=(*inspection.findings, *_masks(options.source, options.masks)))
     if options.json:
         told = asdict(inspection)
         if not inspection.topics:
@@ -71,6 +75,20 @@ def _examine_recording(options: DoctorOptions) -> int:
     else:
         _print_inspection(inspection)
     return DataError.exit_code if inspection.worst == "error" else 0
+
+
+def _masks(source: str, folder: str) -> list[Finding]:
+    from vislam.core.findings import Finding
+    from vislam.frontend.masks import Masks
+    from vislam.runs.sources import open_source
+
+    try:
+        masks = Masks(folder, open_source(source).rig)
+    except DataError as error:
+        return [Finding("error", str(error), folder)]
+    masks.examine()
+    found = [Finding("warning", f"{count} {kind}", folder) for kind, count in masks.problems.items()]
+    return found or [Finding("ok", "masks fit the images", folder)]
 
 
 def _examine_hardware(options: DoctorOptions) -> int:

@@ -108,9 +108,11 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
 
 def run_options(options: RunOptions, command: list[str]) -> dict[str, Any]:
     """Run what the options ask for, with progress on the terminal; return the metrics."""
+    from vislam.runs.folder import map_choice
     from vislam.runs.run import run_source
 
+    choice = map_choice(options.map, options.localize_only, options.settings)
     return run_source(
-        options.source, options.settings, options.out, command,
-        overwrite=options.overwrite, base=options.map, localize_only=options.localize_only, show=progress_bar,
+        options.source, options.settings, options.out, command, overwrite=options.overwrite, choice=choice,
+        show=progress_bar,
     )  # fmt: skip

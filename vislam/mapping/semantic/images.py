@@ -20,6 +20,7 @@ from vislam.mapping.semantic.classes import FILE_NAME, UNLABELLED, LabelClasses
 
 Labels = NDArray[np.uint16]
 
+_TOLERANCE_NS = 1_000_000  # between an image's stamp and that in the name of its labels
 _MISSING = "keyframes without a label image"
 _REFUSED = "label images that cannot be used"
 _UNKNOWN = "label images with ids that have no name"
@@ -55,7 +56,7 @@ class LabelFolder:
 
     def __call__(self, frame: Frame | None, camera_t_ns: int) -> Labels | None:
         """Return the labels [h, w] of the image with a stamp; None where there are none that can be used."""
-        path = self._files.at(camera_t_ns)
+        path = self._files.at(camera_t_ns, _TOLERANCE_NS)
         if path is None:
             self._count(_MISSING, f"the one at {camera_t_ns} ns is the first")
             return None
