@@ -9,7 +9,7 @@ import json
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,13 @@ from vislam.core.reading import MAX_YAML_BYTES, parse_yaml, read_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.tables import check_size
 from vislam.imu import ImuNoise
+from vislam.vision.depth_registration import DepthCamera
 
 _LOG = logging.getLogger(__name__)
 DEPTH_UNITS_PER_M = 1000.0  # millimetres, as ROS and most depth cameras write them: 65.5 m in 16 bits
 _MOST_OFFSET_PX = 1000.0  # more is no camera's: a file that was damaged
 _MOST_TIME_OFFSET_S = 10.0
+_MOST_APART_M = 1.0  # of colour and depth: more is no device's, but millimetres
 MODELS: dict[str, Distortion] = {
     "radial-tangential": "radtan", "radtan": "radtan", "plumb_bob": "radtan",
     "equidistant": "equidistant", "fisheye": "equidistant", "none": "none", "rational_polynomial": "rational",
@@ -51,10 +53,13 @@ CAMERA_EXAMPLE = (
     "T_BS: {rows: 4, cols: 4, data: [16 numbers]}, resolution: [640, 480], intrinsics: [fx, fy, cx, cy], "
     "distortion_model: radial-tangential, distortion_coefficients: [k1, k2, p1, p2]"
 )
+DEPTH_CAMERA_KEYS = "resolution, intrinsics, distortion_model, distortion_coefficients and T_color_depth (4 x 4)"
+_SAME_LENS_PX = 0.5  # registered depth may repeat cam0's intrinsics, rounded
 _SILENT = frozenset({  # keys that say nothing that an estimate could miss, or that other readers of the file ask for
     "sensor_type", "comment", "rostopic", "cam_overlaps", "camera_name", "camera_id", "rate_hz", "update_rate",
     "registered_to", "rectification_matrix", "projection_matrix", "depth_units_per_m", "depth_invalid",
-    "depth_offset_px", "depth_time_offset_s", "gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix",
+    "depth_offset_px", "depth_time_offset_s", "depth_camera",
+    "gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix",
 })  # fmt: skip
 # a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale
 WEIGHTY = re.compile(r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|time_?(shift|offset)|^td$|scale", re.A)
@@ -114,11 +119,12 @@ class DepthFile:
     invalid: tuple[int, ...] | None = None
     offset_px: tuple[float, float] | None = None
     time_offset_s: float | None = None
+    own: DepthCamera | None = None  # of depth that is not registered
 
     def over(self, how: DepthFormat) -> DepthFormat:
         """Return `how`, with what the file states in its place."""
-        said = {key: value for key, value in asdict(self).items() if value is not None}
-        return replace(how, **said)
+        said = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(how, **{name: value for name, value in said.items() if value is not None})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,13 +188,15 @@ def read_imu(path: Path) -> tuple[ImuNoise, Array]:
 
 def read_pose(data: Mapping[str, Any], path: Path) -> Array:
     """Return `T_BS` [4, 4] of a sensor file, identity when it has none; raises DataError unless it is rigid."""
-    if data.get("T_BS") is None:
-        return np.eye(4)
-    matrix = data["T_BS"]
+    return np.eye(4) if data.get("T_BS") is None else _rigid_in(data, "T_BS", path)
+
+
+def _rigid_in(data: Mapping[str, Any], key: str, path: Path) -> Array:
+    matrix = data[key]
     holder = matrix if isinstance(matrix, dict) else {"data": matrix}
     T = np.array(numbers_in(holder, "data", path, 16)).reshape(4, 4)
     if not are_rotations(T[:3, :3], 1e-3):
-        raise DataError(f"{path}: T_BS is not a rigid transform: {T.tolist()}")
+        raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
     return T
 
 
@@ -206,19 +214,46 @@ def parse_depth(data: Mapping[str, Any], path: Path) -> DepthFile:
         [time_offset_s] = numbers_in({"s": [data["depth_time_offset_s"]]}, "s", path, 1)
         if abs(time_offset_s) > _MOST_TIME_OFFSET_S:
             raise DataError(f"{path}: depth_time_offset_s must be within {_MOST_TIME_OFFSET_S} s, got {time_offset_s}")
-    return DepthFile(optional_positive(data, "depth_units_per_m", path), invalid, offset_px, time_offset_s)
+    nested = data.get("depth_camera")
+    if nested is not None and not isinstance(nested, dict):
+        raise DataError(f"{path}: depth_camera must hold {DEPTH_CAMERA_KEYS}, got {str(nested)[:80]}")
+    own = None if nested is None else parse_depth_camera(nested, path)
+    return DepthFile(optional_positive(data, "depth_units_per_m", path), invalid, offset_px, time_offset_s, own)
 
 
-def depth_format(path: Path, camera: Camera) -> DepthFormat:
-    """Return how to read a depth folder by its sensor file; raises DataError unless it is registered to cam0."""
+def parse_depth_camera(data: Mapping[str, Any], path: Path) -> DepthCamera:
+    """Return lens and place of depth that is not registered; raises DataError naming the key."""
+    for key in ("T_color_depth", "intrinsics", "resolution"):
+        if data.get(key) is None:
+            raise DataError(f"{path}: depth with a lens of its own has no {key}; write {DEPTH_CAMERA_KEYS}")
+    T = _rigid_in(data, "T_color_depth", path)
+    if not np.linalg.norm(T[:3, 3]) <= _MOST_APART_M:
+        raise DataError(f"{path}: T_color_depth puts depth {np.linalg.norm(T[:3, 3]):.3g} m from colour; write metres")
+    return DepthCamera(parse_camera(data, path, "distortion_coefficients"), T)
+
+
+def depth_format(path: Path, camera: Camera, usual: DepthFormat) -> DepthFormat:
+    """Return how to read a depth folder by its sensor file, beside images of `camera`; else as `usual`.
+
+    Depth is registered unless the file states `T_color_depth`. Raises DataError where it contradicts itself.
+    """
     data = load_yaml(path)
+    how = parse_depth(data, path).over(usual)
+    if data.get("T_color_depth") is not None:
+        if data.get("registered_to") is not None:
+            raise DataError(f"{path}: depth is registered_to a camera or has a T_color_depth; remove one of them")
+        return replace(how, own=parse_depth_camera(data, path))
     resolution = [int(x) for x in numbers_in(data, "resolution", path, 2)] if "resolution" in data else None
     if resolution is not None and resolution != [camera.width, camera.height]:
         raise DataError(
-            f"{path}: depth of {resolution} does not match cam0's {camera.width}x{camera.height}; "
-            "depth must be registered to cam0, pixel by pixel"
+            f"{path}: depth of {resolution} does not match cam0's {camera.width}x{camera.height}; register it to cam0, "
+            f"pixel by pixel, or write {DEPTH_CAMERA_KEYS}"
         )
-    return parse_depth(data, path).over(DepthFormat(DEPTH_UNITS_PER_M))
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    stated = pinhole if data.get("intrinsics") is None else numbers_in(data, "intrinsics", path, 4)
+    if not np.allclose(stated, pinhole, rtol=0.0, atol=_SAME_LENS_PX):
+        raise DataError(f"{path}: intrinsics differ from cam0's, but there is no T_color_depth; write it, too")
+    return how
 
 
 def parse_camera(data: Mapping[str, Any], path: Path, coefficients_key: str) -> Camera:
@@ -346,11 +381,16 @@ def depth_text(camera: Camera, units_per_m: float) -> str:
 
 
 def depth_keys_text(how: DepthFormat) -> str:
-    """Return the keys of a sensor file that say how depth images are read."""
+    """Return the keys of a camera's sensor file that say how depth images are read."""
     invalid = f"depth_invalid: [{', '.join(map(str, how.invalid))}]\n" if how.invalid else ""
+    own = ""
+    if how.own is not None:
+        lens = camera_text(how.own.camera, None, "depth").splitlines(keepends=True)
+        place = f"T_color_depth: {list_text(how.own.T_color_depth.ravel())}\n"
+        own = "depth_camera:\n" + "".join(f"  {line}" for line in [*lens, place])
     return (
         f"depth_units_per_m: {float(how.units_per_m)!r}\n{invalid}depth_offset_px: {list_text(how.offset_px)}\n"
-        f"depth_time_offset_s: {float(how.time_offset_s)!r}\n"
+        f"depth_time_offset_s: {float(how.time_offset_s)!r}\n{own}"
     )
 
 

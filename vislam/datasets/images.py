@@ -21,6 +21,7 @@ from vislam.core.encoded_image import decoded, image_size
 from vislam.core.errors import DataError
 from vislam.core.messages import ImageF32, ImageU8
 from vislam.core.reading import open_file, read_bytes
+from vislam.vision.depth_registration import DepthCamera
 
 Stamps = NDArray[np.int64]
 Job = TypeVar("Job")
@@ -62,12 +63,17 @@ class ImageList:
 
 @dataclass(frozen=True, slots=True)
 class DepthFormat:
-    """What the numbers in depth images mean, and where they lie in the colour image."""
+    """What the numbers in depth images mean, and through which lens, where and when they were measured."""
 
     units_per_m: float = 1.0
     invalid: tuple[int, ...] = ()  # raw values that mean "nothing measured", besides 0 and the largest of 16 bits
-    offset_px: tuple[float, float] = (0.0, 0.0)  # by which depth lies right of and below what it belongs to
+    offset_px: tuple[float, float] = (0.0, 0.0)  # by which depth lies right of and below where it should
     time_offset_s: float = 0.0  # its stamps plus this are by the clock of the colour image; the list has it already
+    own: DepthCamera | None = None  # its lens and place; None: each pixel is that of the colour image
+
+    def camera(self, color: Camera) -> Camera:
+        """Return the camera whose pixels depth images as stored have."""
+        return color if self.own is None else self.own.camera
 
     def in_m(self, raw: NDArray[np.uint16]) -> ImageF32:
         """Return depth in metres [H, W], 0 where invalid, shifted back by whole pixels."""
@@ -197,9 +203,12 @@ def read_any_size(path: Path) -> ImageU8 | None:
         return None
 
 
-def read_depth(path: Path, camera: Camera, how: DepthFormat) -> ImageF32:
-    """Return depth in metres [H, W] of a 16-bit PNG, 0 where invalid; raises as `read_grey_or_color` does."""
-    return how.in_m(read_raw_depth(path, camera))
+def read_depth(path: Path, color: Camera, how: DepthFormat) -> ImageF32:
+    """Return depth in metres [H, W] of a 16-bit PNG, 0 where invalid; raises as `read_grey_or_color` does.
+
+    It is not registered: where depth has a lens of its own, pixels are those of that lens.
+    """
+    return how.in_m(read_raw_depth(path, how.camera(color)))
 
 
 def read_raw_depth(path: Path, camera: Camera) -> NDArray[np.uint16]:

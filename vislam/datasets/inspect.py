@@ -180,7 +180,9 @@ class _Inspector:
             self._check_stream(images.name, images.t_ns)
             if found.video is None and found.streams is None:
                 is_depth = images is found.depth
-                self._check_images(images, _camera_of(found.rig, 0 if is_depth else index), is_depth)
+                camera = _camera_of(found.rig, 0 if is_depth else index)
+                stored = found.depth_format.camera(camera) if is_depth and camera is not None else camera
+                self._check_images(images, stored, is_depth)
         self._size_bytes += sum(path.stat().st_size for path in found.videos)
         if found.streams is not None and frames is not None:
             for index, images in enumerate(found.cameras):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -22,6 +22,7 @@ from vislam.datasets.images import (
     read_depth,
     read_grey_or_color,
 )
+from vislam.vision.depth_registration import DepthCamera, DepthRegistration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +98,26 @@ class FolderLoader:
 
     def close(self) -> None:
         """Nothing is held open."""
+
+
+class RegisteringLoader:
+    """Loads frames whose depth has a lens of its own, registered to the first camera's pixels."""
+
+    def __init__(self, loader: Loader, depth: DepthCamera, color: Camera) -> None:
+        """Take what loads the images as they are stored."""
+        self.workers = loader.workers
+        self._loader, self._registration = loader, DepthRegistration(depth, color)
+
+    def load(self, i: int) -> LoadedImages:
+        """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
+        loaded = self._loader.load(i)
+        if loaded.depth_m is None:
+            return loaded
+        return replace(loaded, depth_m=self._registration.registered(loaded.depth_m))
+
+    def close(self) -> None:
+        """Let go of what is open."""
+        self._loader.close()
 
 
 class VideoLoader:

@@ -29,7 +29,7 @@ from vislam.datasets.images import (
     probe,
 )
 from vislam.datasets.imu_pairs import ImuRows
-from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, VideoLoader
+from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, RegisteringLoader, VideoLoader
 from vislam.datasets.tables import Row, in_time_order, read_numbers
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.trajectory import Trajectory
@@ -193,8 +193,14 @@ def _unpaired(partners: NDArray[np.int64], others: int) -> int:
 def open_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | None = None) -> Loader:
     """Return what loads the frames of a survey, of its first `cameras` only if given; close it after use.
 
-    Raises DataError when a video cannot be opened.
+    Depth comes registered to the first camera. Raises DataError when a video cannot be opened.
     """
+    loader = _stored_loader(survey, rig, frames, cameras)
+    own = survey.depth_format.own
+    return loader if own is None else RegisteringLoader(loader, own, rig.cameras[0])
+
+
+def _stored_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | None) -> Loader:
     if survey.streams is not None:
         return survey.streams.open_loader(rig, frames, cameras)
     if survey.video is not None:

@@ -22,6 +22,7 @@ from vislam.datasets.bags.decoding import (
 )
 from vislam.datasets.bags.listing import Entry, Listing
 from vislam.datasets.bags.pictures import is_depth, size_px
+from vislam.datasets.bags.transforms import Frames
 
 NONE = "none"
 TRUTHS = (POSE, POSE_COVARIANCE, ODOMETRY, TRANSFORM)
@@ -72,6 +73,7 @@ class Choice:
     cameras: tuple[ImageFacts, ...]
     infos: tuple[Entry | None, ...]  # of each camera
     depth: ImageFacts | None
+    depth_info: Entry | None  # of its calibration, where it is not registered
     imu: Entry | None
     forces: Entry | None  # of the IMU, where its own topic has rates alone
     mag: Entry | None
@@ -83,6 +85,8 @@ class Choice:
         taken |= {info.topic.name: f"calibration of cam{k}" for k, info in enumerate(self.infos) if info is not None}
         if self.depth is not None:
             taken[self.depth.name] = "depth0"
+        if self.depth_info is not None:
+            taken[self.depth_info.topic.name] = "calibration of depth0"
         rates = "imu0" if self.forces is None else "rates of imu0"
         samples = ((rates, self.imu), ("forces of imu0", self.forces), ("mag0", self.mag), ("truth", self.truth))
         for role, entry in samples:
@@ -91,8 +95,8 @@ class Choice:
         return taken
 
 
-def chosen(listing: Listing, options: BagOptions) -> Choice:
-    """Return which topic is which sensor; raises DataError for one that was given and is not there."""
+def chosen(listing: Listing, options: BagOptions, frames: Frames) -> Choice:
+    """Return which topic is which sensor; raises DataError for one that was given and is not there or of no use."""
     images = [_facts(listing, entry) for entry in listing.of_type(IMAGE, COMPRESSED)]
     usual = [facts for facts in images if facts.size_px is not None]
     colors = [facts for facts in usual if not _looks_like_depth(facts)]
@@ -105,7 +109,16 @@ def chosen(listing: Listing, options: BagOptions) -> Choice:
     cameras = tuple(camera for camera in (cam0, cam1) if camera is not None and cam0 is not None)
     depth = told_depth
     if depth is None and options.depth is None and cam0 is not None and len(cameras) == 1:
-        depth = next((facts for facts in depths if _registered(facts, cam0)), None)
+        fitting = [facts for facts in depths if _registered(facts, cam0)]
+        fitting += [facts for facts in depths if _info_of_depth(listing, facts, cam0, frames) is not None]
+        depth = next(iter(fitting), None)
+    depth_info = None if depth is None or cam0 is None else _info_of_depth(listing, depth, cam0, frames)
+    if depth is not None and cam0 is not None and depth_info is None and depth.size_px != cam0.size_px:
+        raise DataError(
+            f"depth={depth.name}: its images are not of the size of {cam0.name}, so they need a CameraInfo beside them "
+            f"and transforms from {cam0.frame or 'an unnamed frame'} to {depth.frame or 'an unnamed frame'}; or "
+            "register depth, or leave it out: depth=none"
+        )
     infos = tuple(
         _entry(listing, f"info{k}", given, (CAMERA_INFO,), _info(listing, camera, len(cameras)))
         for k, (camera, given) in enumerate(zip(cameras, (options.info0, options.info1), strict=False))
@@ -115,6 +128,7 @@ def chosen(listing: Listing, options: BagOptions) -> Choice:
         cameras,
         infos,
         depth if cam0 is not None else None,
+        depth_info,
         *_imu(listing, options.imu),
         _entry(listing, "mag", options.mag, (MAGNETIC,), max(mags, key=lambda entry: entry.count, default=None)),
         _entry(listing, "truth", options.truth, TRUTHS, None),
@@ -211,6 +225,15 @@ def _registered(depth: ImageFacts, color: ImageFacts) -> bool:
 
 def _is_registered(depth: ImageFacts) -> bool:
     return any(word in depth.name for word in _REGISTERED)
+
+
+def _info_of_depth(listing: Listing, depth: ImageFacts, cam0: ImageFacts, frames: Frames) -> Entry | None:
+    """Return the calibration of depth that is not registered; None where it is, or where lens or place are unknown."""
+    if _registered(depth, cam0):
+        return None
+    info = _info(listing, depth, 2)
+    is_placed = bool(cam0.frame and depth.frame) and frames.between(cam0.frame, depth.frame) is not None
+    return info if info is not _info(listing, cam0, 1) and is_placed else None
 
 
 def _info(listing: Listing, camera: ImageFacts, cameras: int) -> Entry | None:

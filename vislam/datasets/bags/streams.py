@@ -25,6 +25,7 @@ from vislam.datasets.images import UnreadableImageError
 from vislam.datasets.imu_pairs import paired
 from vislam.datasets.loaders import FrameTable, LoadedImages
 from vislam.datasets.tables import Row, in_time_order
+from vislam.vision.depth_registration import DepthCamera
 
 _ENOUGH = 20  # messages, and most of them unusable, settle it
 _UT_PER_TESLA = 1e6
@@ -52,17 +53,18 @@ class BagStreams:
         samples: tuple[Topic | None, Topic | None],
         by_log_time: bool,
         forces: tuple[Topic, Array] | None = None,
+        own: DepthCamera | None = None,
     ) -> None:
         """Take the topics of images, of inertial samples and of the field.
 
         `forces` is the topic of an accelerometer that is apart, and its rotation [3, 3] in the body; then those of the
-        inertial samples are rates alone.
+        inertial samples are rates alone. `own` is the lens of depth that is not registered.
         """
         self._bag = bag
         self._cameras, self._depth = tuple(cameras), depth
         self._imu, self._mag = samples
         self._forces = forces
-        self._by_log_time = by_log_time
+        self._by_log_time, self._own = by_log_time, own
 
     @property
     def size_bytes(self) -> int:
@@ -96,7 +98,7 @@ class BagStreams:
 
     def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> BagLoader:
         """Return what loads the images of frames, of the first `cameras` only if given."""
-        return BagLoader(self._bag, frames, self._cameras[:cameras], self._depth, rig)
+        return BagLoader(self._bag, frames, self._cameras[:cameras], self._depth, rig, self._own)
 
     def repeats(self, camera: int) -> Iterator[bool]:
         """Yield for each image of a camera but the first whether it equals the one before to the byte."""
@@ -116,9 +118,11 @@ class BagLoader:
     workers = 2
 
     def __init__(
-        self, bag: Bag, frames: FrameTable, cameras: tuple[ImageTopic, ...], depth: ImageTopic | None, rig: Rig
-    ) -> None:
+        self, bag: Bag, frames: FrameTable, cameras: tuple[ImageTopic, ...], depth: ImageTopic | None,
+        rig: Rig, own: DepthCamera | None = None,
+    ) -> None:  # fmt: skip
         self._bag, self._frames, self._cameras, self._depth, self._rig = bag, frames, cameras, depth, rig
+        self._depth_camera = rig.cameras[0] if own is None else own.camera
 
     def load(self, i: int) -> LoadedImages:
         """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
@@ -150,7 +154,7 @@ class BagLoader:
 
     def _depth_m(self, topic: ImageTopic, row: int) -> ImageF32:
         message, path = _message(self._bag, topic, row)
-        camera = self._rig.cameras[0]
+        camera = self._depth_camera
         return (pictures.unpacked_depth_m if topic.compressed else pictures.depth_m)(message, camera, path)
 
 

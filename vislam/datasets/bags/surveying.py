@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,19 +35,29 @@ from vislam.datasets.bags.transforms import Frames, rigid
 from vislam.datasets.calibrated import joined_rig
 from vislam.datasets.foreign_cameras import ros_camera
 from vislam.datasets.formats.truth import Truth, trajectory_of
-from vislam.datasets.images import ImageList
+from vislam.datasets.images import DepthFormat, ImageList
 from vislam.datasets.imu_files import read_noise
 from vislam.datasets.plausibility import imu_facts, mean_force, unit_doubt
 from vislam.datasets.stream import FRAME_HOLE_S, KnownCamera, Survey, TopicSummary
 from vislam.datasets.tables import Row, in_time_order
 from vislam.imu import ImuNoise
 from vislam.trajectory import Trajectory
+from vislam.vision.depth_registration import DepthCamera
 
 _LOG = logging.getLogger(__name__)
 _LOOKED_AT_NS = 20_000_000_000  # of the inertial samples, to see whether their units can be
 _VIDEOS = ("CompressedVideo", "FFMPEGPacket")
 _CALIBRATION = "--calibration.camera FILE"
 _NOISE = "--calibration.imu-noise FILE"
+
+
+class _Bag(NamedTuple):
+    """A bag, what is in it, where its sensors sit, and the lens of depth that is not registered."""
+
+    bag: Bag
+    listing: Listing
+    frames: Frames
+    own: DepthCamera | None
 
 
 @dataclass(slots=True)
@@ -72,14 +82,15 @@ def survey_bag(path: Path, options: BagOptions) -> Survey:
     except DataError as error:
         return Survey("bag", path, errors=(error,))
     try:
-        choice = chosen(listing, options)
+        frames = _frames(listing)
+        choice, own = _with_lens(chosen(listing, options, frames), listing, frames, options, found.problems)
     except DataError as error:
         return Survey("bag", path, topics=_topics(listing, {}), problems=found.problems, errors=(error,))
-    return _survey(path, bag, listing, choice, options, found)
+    return _survey(path, _Bag(bag, listing, frames, own), choice, options, found)
 
 
-def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: BagOptions, found: _Found) -> Survey:
-    frames = _frames(listing)
+def _survey(path: Path, whole: _Bag, choice: Choice, options: BagOptions, found: _Found) -> Survey:
+    bag, listing, frames, own = whole
     images = [_images(facts, f"cam{k}", found.problems) for k, facts in enumerate(choice.cameras)]
     depth = None if choice.depth is None else _images(choice.depth, "depth0", found.problems)
     by_log_time = options.stamps == "log"
@@ -87,7 +98,7 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
     samples = tuple(None if entry is None else entry.topic for entry in (choice.imu, choice.mag))
     streams = BagStreams(
         bag, [topic for _, topic in images], None if depth is None else depth[1], (samples[0], samples[1]), by_log_time,
-        _forces(listing, choice, frames, body),
+        _forces(listing, choice, frames, body), own,
     )  # fmt: skip
     if not images and options.cam0 != NONE and (lacks := _without_images(path, listing, choice)) is not None:
         found.errors.append(lacks)
@@ -106,6 +117,7 @@ def _survey(path: Path, bag: Bag, listing: Listing, choice: Choice, options: Bag
         root=path,
         cameras=tuple(listed for listed, _ in images),
         depth=None if depth is None else depth[0],
+        depth_format=DepthFormat(own=own),
         rig=rig,
         streams=streams,
         imu_noise=noise,
@@ -233,25 +245,46 @@ def _known_cameras(
     return tuple(known)
 
 
-def _lens(facts: ImageFacts, info: Any) -> Camera:
+def _with_lens(
+    choice: Choice, listing: Listing, frames: Frames, options: BagOptions, problems: Problems
+) -> tuple[Choice, DepthCamera | None]:
+    """Return the choice with lens and place of depth that is not registered; without depth that nobody asked for.
+
+    Raises DataError where it was asked for and its calibration is none.
+    """
+    if choice.depth is None or choice.depth_info is None:
+        return choice, None
+    T_color_depth = frames.between(choice.cameras[0].frame, choice.depth.frame)
+    info = next(listing.first_messages(choice.depth_info), None)
+    try:
+        lens = _lens(choice.depth, info, "register it, or leave it out: depth=none")
+    except DataError as error:
+        if options.depth is not None:
+            raise
+        problems.count(f"depth is left out: {error}")
+        return replace(choice, depth=None, depth_info=None), None
+    return choice, None if T_color_depth is None else DepthCamera(lens, T_color_depth)
+
+
+def _lens(facts: ImageFacts, info: Any, next_step: str = f"give {_CALIBRATION}") -> Camera:
     where = facts.name
     if info is None:
-        raise DataError(f"{where}: no CameraInfo beside its images; give {_CALIBRATION}")
+        raise DataError(f"{where}: no CameraInfo beside its images; {next_step}")
     K, P = _matrix(info, "k", (3, 3)), _matrix(info, "p", (3, 4))
     name, coefficients = str(info.distortion_model), [float(x) for x in getattr(info, "d", getattr(info, "D", ()))]
     if _is_rectified(facts):
         K, name, coefficients = P[:, :3], "none", []
     if not (np.all(np.isfinite(K)) and K[0, 0] > 0.0 and K[1, 1] > 0.0):
-        raise DataError(f"{where}: its CameraInfo is not calibrated (focal lengths of 0); give {_CALIBRATION}")
+        raise DataError(f"{where}: its CameraInfo is not calibrated (focal lengths of 0); {next_step}")
     assert facts.size_px is not None
     size = (int(info.width), int(info.height))
     if size != facts.size_px:
         sizes = f"CameraInfo is for {size[0]}x{size[1]}, its images are {facts.size_px[0]}x{facts.size_px[1]}"
-        raise DataError(f"{where}: its {sizes}; give {_CALIBRATION}")
+        raise DataError(f"{where}: its {sizes}; {next_step}")
     try:
         return ros_camera(size, K, name, coefficients, where)
     except DataError as error:
-        raise DataError(f"{error}; give {_CALIBRATION}") from error
+        raise DataError(f"{error}; {next_step}") from error
 
 
 def _matrix(info: Any, name: str, shape: tuple[int, int]) -> Array:

@@ -163,14 +163,15 @@ def _depth(
 ) -> tuple[ImageList | None, DepthFormat]:
     """Return the depth images, with their stamps as written, and how they are read."""
     folder = root / "depth0"
+    usual = DepthFormat(DEPTH_UNITS_PER_M)
     if rig is None or not folder.is_dir():
-        return None, DepthFormat(DEPTH_UNITS_PER_M)
+        return None, usual
     try:
-        how = files.depth_format(folder / "sensor.yaml", rig.cameras[0])
+        how = files.depth_format(folder / "sensor.yaml", rig.cameras[0], usual)
         return image_list("depth0", folder / "data", read_names(folder / "data.csv", problems), problems), how
     except DataError as error:
         errors.append(error)
-        return None, DepthFormat(DEPTH_UNITS_PER_M)
+        return None, usual
 
 
 def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path | None, Array, MagCalibration | None]:

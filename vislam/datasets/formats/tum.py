@@ -2,8 +2,8 @@
 
 Intrinsics are those that the benchmark publishes per camera (Sturm et al., "A benchmark for the evaluation of RGB-D
 SLAM systems", IROS 2012, and the page "file formats" beside it), unless the folder brings its own calibration. Depth is
-registered to colour, 5000 units per metre; the page's depth correction is already in the images. The accelerometer has
-no gyroscope beside it: it shows which way is up, and nothing else.
+registered to colour, 5000 units per metre, unless `depth/sensor.yaml` says otherwise; the page's depth correction is
+already in the images. The accelerometer has no gyroscope beside it: it shows which way is up, and nothing else.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.recording import Problems
-from vislam.datasets.calibration import CAMERA_EXAMPLE, CameraFile, read_camera
+from vislam.datasets.calibration import CAMERA_EXAMPLE, CameraFile, depth_format, read_camera
 from vislam.datasets.formats.truth import tum_truth
 from vislam.datasets.images import DepthFormat, ImageList
 from vislam.datasets.stream import ForceRows, Survey, image_list, with_depth_format
@@ -26,6 +26,7 @@ from vislam.datasets.tables import Row, parse_seconds, read_names, read_numbers
 LOOKS_FOR = "rgb.txt"
 _DEPTH_UNITS_PER_M = 5000.0
 _FORCE_SIGNS = (-1.0, -1.0, 1.0)  # of the Kinect's accelerometer in camera axes, as freiburg1_desk's truth shows
+_DEPTH_FILE = "depth/sensor.yaml"  # where depth has one of its own
 _CALIBRATION_FILES = ("sensor.yaml", "calibration.yaml")
 _FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
 _FR2 = (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)
@@ -45,10 +46,14 @@ def survey(path: Path) -> Survey:
     """Return what a TUM folder holds; what is wrong with it is in `errors`."""
     problems = Problems()
     errors: list[DataError] = []
+    how = DepthFormat(_DEPTH_UNITS_PER_M)
     calibration: CameraFile | None = None
     color = depth = None
     try:
         calibration = _calibration(path)
+        how = calibration.depth.over(how)
+        if (path / _DEPTH_FILE).is_file():
+            how = depth_format(path / _DEPTH_FILE, calibration.camera, how)
     except DataError as error:
         errors.append(error)
     try:
@@ -73,7 +78,7 @@ def survey(path: Path) -> Survey:
         errors=tuple(errors),
         depth_format=DepthFormat(_DEPTH_UNITS_PER_M),
     )
-    return found if calibration is None else with_depth_format(found, calibration.depth.over(found.depth_format))
+    return with_depth_format(found, how)
 
 
 def _forces(path: Path) -> ForceRows:

@@ -86,7 +86,8 @@ def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, floa
         return (), float("nan"), float("nan")
     for i in np.unique(np.linspace(0, len(depth.files) - 1, _HISTOGRAMS).astype(int)):
         try:
-            one = np.bincount(read_raw_depth(depth.path(int(i)), rig.cameras[0]).ravel(), minlength=NO_DEPTH + 1)
+            raw = read_raw_depth(depth.path(int(i)), found.depth_format.camera(rig.cameras[0]))
+            one = np.bincount(raw.ravel(), minlength=NO_DEPTH + 1)
         except UnreadableImageError:
             continue
         counts, images, read = counts + one, images + (one > 0), read + 1
