@@ -13,14 +13,16 @@ import pytest
 from vislam.calibration.cameras import rgbd
 from vislam.calibration.options import RgbdOptions
 from vislam.cli import run_verb
+from vislam.core.camera import Camera
 from vislam.core.errors import DataError, UsageError
 from vislam.datasets import survey
 from vislam.datasets.calibration import read_camera
 from vislam.datasets.images import DepthFormat
-from vislam.datasets.rgbd import RgbdFacts
+from vislam.datasets.rgbd import PlaceFit, RgbdFacts
 from vislam.datasets.rgbd.facts import OddValue
 from vislam.vision.depth_edges import EdgeAlignment
 from vislam.vision.depth_focal import FocalFit
+from vislam.vision.depth_registration import DepthCamera
 
 
 def write_folder(folder: Path, frames: int = 3) -> Path:
@@ -74,6 +76,27 @@ def test_what_is_measured_twice_is_written_once_and_read_back(tmp_path: Path, mo
     assert {path.name for path in outcome.files} == {"sensor.yaml", "rgbd.png", "rgbd.json"}
     with pytest.raises(UsageError, match="already holds"):
         rgbd.calibrate_rgbd(RgbdOptions(str(source), out=tmp_path / "out"))
+
+
+def test_depth_with_a_lens_of_its_own_is_placed_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = write_folder(tmp_path / "fr1")
+    keys = "resolution: [640, 480]\nintrinsics: [600, 600, 320, 240]\n"
+    (source / "depth" / "sensor.yaml").write_text(f"{keys}T_color_depth: {np.eye(4).tolist()}\n")
+    T = np.eye(4)
+    T[0, 3] = 0.05
+    lens = Camera(640, 480, 590.0, 590.0, 320.0, 240.0)
+    how = DepthFormat(5000.0, time_offset_s=-0.02, own=DepthCamera(lens, T))
+    sigmas = np.full(3, 0.001), np.array([0.001, 0.001, 0.02])
+    monkeypatch.setattr(rgbd, "fit_place", lambda found, rig: PlaceFit(how, *sigmas, 0.002, 0.001, 9000))
+    monkeypatch.setattr(rgbd, "rgbd_facts", lambda found, rig, frames: facts((3.0, 0.0), 0.03, 1.0))
+    outcome = rgbd.calibrate_rgbd(RgbdOptions(str(source), out=tmp_path / "out"))
+    read = read_camera(tmp_path / "out" / "sensor.yaml").depth.over(DepthFormat())
+    assert read.own is not None and read.own.camera == lens and np.array_equal(read.own.T_color_depth, T)
+    assert read.time_offset_s == -0.02 and read.offset_px == (0.0, 0.0)
+    said = "\n".join(outcome.lines)
+    assert "50.0 ± 1.0, 0.0 ± 1.0, 0.0 ± 20.0 mm right of, below and ahead" in said and "late by 20.0 ± 1.0 ms" in said
+    assert "the place of depth to the ahead" not in said and "ahead could not be found" in said
+    assert json.loads((tmp_path / "out" / "rgbd.json").read_text())["T_color_depth"] == T.tolist()
 
 
 def test_a_camera_that_sees_a_wall_is_refused_and_nothing_is_written(

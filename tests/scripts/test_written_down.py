@@ -66,6 +66,7 @@ SMALLEST = {
     "experiments/self_calibration.py": "{recording} --out out",
     "experiments/spoilt_rgbd.py": "{recording} --cases 0",
     "experiments/starts.py": "--plan {plan} --count 1",
+    "experiments/unregistered_depth.py": "--help",
     "experiments/up_without_imu.py": "--recording {recording}",
     "benchmarks/bag_reader.py": "--frames 5 --size 64 48 --rounds 1",
     "benchmarks/drawn_camera.py": "--width 64 --frames 1 --rounds 1 --moments 2",

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.messages import Array, ImageF32, ImageU8
 
@@ -82,6 +83,17 @@ def frame_ends(depth_m: ImageF32, image: ImageU8, flow_px_s: ImageF32, delay_s: 
         count.append(len(rows))
         speed.append(float(np.median(np.abs(moved))) if len(moved) else 0.0)
     return FrameEnds(np.array(scores), np.array(count), np.array(speed))
+
+
+def foreground_ends(depth_m: ImageF32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the last pixels [N, 2] (right, down) of foregrounds in depth [H, W], and pixels [N, 2] inside of them."""
+    ends, inside = [], []
+    for axis in (0, 1):
+        rows, columns, sides = _ends(depth_m if axis == 0 else np.ascontiguousarray(depth_m.T))
+        order = (0, 1) if axis == 0 else (1, 0)
+        ends.append(np.column_stack([columns, rows])[:, order])
+        inside.append(np.column_stack([columns - 2 * sides, rows])[:, order])
+    return np.vstack(ends).astype(np.int64), np.vstack(inside).astype(np.int64)
 
 
 def _ends(depth_m: ImageF32) -> tuple[Array, Array, Array]:

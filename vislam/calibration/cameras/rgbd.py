@@ -1,7 +1,8 @@
 """`vislam calibrate rgbd`: where and when depth is against colour, and the focal length that both agree on.
 
 What is wrong is measured and mended, then measured once more on the mended recording, and what is left is added. The
-unit of depth is no part of it: images and depth alone look the same in a world of another size.
+unit of depth is no part of it: images and depth alone look the same in a world of another size. Depth with a lens of
+its own has its place, focal length and lag found first, then the focal length of colour.
 """
 
 from __future__ import annotations
@@ -16,16 +17,21 @@ from matplotlib.figure import Figure
 
 from vislam.calibration.options import RgbdOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
+from vislam.core.angles import angles_of
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.recording import Problems
 from vislam.datasets import survey
 from vislam.datasets.calibration import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat
-from vislam.datasets.rgbd import Known, RgbdFacts, known, rgbd_facts
+from vislam.datasets.rgbd import Known, PlaceFit, RgbdFacts, fit_place, known, rgbd_facts
 from vislam.datasets.stream import Survey, frame_table, with_depth_format
+from vislam.vision.depth_registration import DepthCamera
 
 _FILES = ("sensor.yaml", "rgbd.png", "rgbd.json")
+_MOST_TURN_SIGMA_RAD, _MOST_PLACE_SIGMA_M = 0.005, 0.005  # a pixel or two; more was not found
+_MOST_FOCAL_SIGMA, _MOST_LAG_SIGMA_S = 0.01, 0.01
+_CENTRE = "the principal point of depth stays as it was: moving it looks as turning depth does"
 _WORTH = 2.0  # sigmas: what is nearer to nothing stays as it was given
 _SCALE = "the unit of depth cannot be found from images and depth: measure something of known length in the map"
 
@@ -39,6 +45,7 @@ class RgbdCalibration:
     sure: Known  # of which something could be said
     before: RgbdFacts
     after: RgbdFacts
+    place: PlaceFit | None = None  # of depth with a lens of its own
 
 
 def calibrate_rgbd(options: RgbdOptions) -> Outcome:
@@ -64,16 +71,20 @@ def fit_rgbd(source: str) -> RgbdCalibration:
         raise error
     if found.rig is None or found.depth is None:
         raise DataError(f"{source} has no depth images beside those of a calibrated camera")
+    place = None if found.depth_format.own is None else fit_place(found, found.rig)
+    if place is not None:
+        found = with_depth_format(found, place.how)
     before = _measured(found)
     sure = known(before)
-    _refuse_blind(source, before, sure)
+    if place is None:
+        _refuse_blind(source, before, sure)
     mended = _mended(found, before, sure)
     after = _measured(mended)
     again = known(after)
     both = Known(sure.offset and again.offset, sure.lag and again.lag, sure.focal and again.focal)
     mended = _mended(mended, after, both)
     assert mended.rig is not None
-    return RgbdCalibration(mended.rig, mended.depth_format, sure, before, after)
+    return RgbdCalibration(mended.rig, mended.depth_format, sure, before, after, place)
 
 
 def _measured(found: Survey) -> RgbdFacts:
@@ -106,7 +117,7 @@ def _mended(found: Survey, facts: RgbdFacts, sure: Known) -> Survey:
     how, rig = found.depth_format, found.rig
     invalid = tuple(odd.value for odd in facts.odd_values if not odd.is_known)
     offset_px, time_offset_s = how.offset_px, how.time_offset_s
-    if facts.edges is not None:
+    if facts.edges is not None and how.own is None:
         # depth was read shifted by whole pixels, so what is left is beyond those
         measured = facts.offset_px
         worth = np.abs(measured) > _WORTH * facts.edges.offset_sigma_px
@@ -120,27 +131,45 @@ def _mended(found: Survey, facts: RgbdFacts, sure: Known) -> Survey:
         camera = rig.cameras[0]
         camera = replace(camera, fx=camera.fx * focal.factor, fy=camera.fy * focal.factor)
         rig = Rig((camera, *rig.cameras[1:]), rig.T_body_cams, rig.has_depth)
-    said = DepthFormat(how.units_per_m, (*how.invalid, *invalid), offset_px, time_offset_s)
+    said = replace(how, invalid=(*how.invalid, *invalid), offset_px=offset_px, time_offset_s=time_offset_s)
     return with_depth_format(replace(found, rig=rig), said)
 
 
 def _statements(found: RgbdCalibration) -> list[str]:
     """Return what a user must know of how far the numbers can be trusted."""
     sure = {"the place of depth": found.sure.offset, "its lag": found.sure.lag, "the focal length": found.sure.focal}
+    stays = "as it was" if found.how.own is None else "near what was given"
+    if found.how.own is not None:
+        sure = {"the focal length of colour": found.sure.focal} | _sure_of(found.place)
     unknown = [what for what, is_sure in sure.items() if not is_sure]
-    said = [f"{' and '.join(unknown)} could not be found and stays as it was"] if unknown else []
-    return [*said, _SCALE]
+    said = [f"{' and '.join(unknown)} could not be found and stays {stays}"] if unknown else []
+    return [*said, *([] if found.how.own is None else [_CENTRE]), _SCALE]
+
+
+def _sure_of(place: PlaceFit | None) -> dict[str, bool]:
+    """Return what of the place of depth the recording shows."""
+    if place is None:
+        return dict.fromkeys(("the place of depth", "its focal length", "its lag"), False)
+    axes = zip(("to the right", "down", "ahead"), place.place_sigma_m, strict=True)
+    return {
+        "the turn of depth": bool(place.turn_sigma_rad.max() < _MOST_TURN_SIGMA_RAD),
+        **{f"the place of depth {name}": bool(sigma < _MOST_PLACE_SIGMA_M) for name, sigma in axes},
+        "the focal length of depth": place.focal_sigma < _MOST_FOCAL_SIGMA,
+        "the lag of depth": place.lag_sigma_s < _MOST_LAG_SIGMA_S,
+    }
 
 
 def _lines(found: RgbdCalibration) -> list[str]:
     facts, camera, out = found.before, found.rig.cameras[0], []
     for odd in facts.odd_values:
         out.append(f"depth {odd.value} means that nothing was measured: {odd.share:.1%} of the pixels")
-    if facts.edges is not None and found.sure.offset:
+    if found.place is not None and found.how.own is not None:
+        out += _place_lines(found.place, found.how.own)
+    if facts.edges is not None and found.sure.offset and found.how.own is None:
         sigma_px = facts.edges.offset_sigma_px
         dx, dy = found.how.offset_px
         out.append(f"depth lies {dx:.2f} ± {sigma_px[0]:.2f} px right and {dy:.2f} ± {sigma_px[1]:.2f} px down")
-    if facts.edges is not None and found.sure.lag:
+    if facts.edges is not None and found.sure.lag and found.how.own is None:
         ms, sigma_ms = -1e3 * found.how.time_offset_s, 1e3 * facts.edges.lag_sigma_s
         out.append(f"depth is late by {ms:.1f} ± {sigma_ms:.1f} ms")
     if facts.focal is not None and found.sure.focal:
@@ -149,6 +178,19 @@ def _lines(found: RgbdCalibration) -> list[str]:
         ms, sigma_ms = 1e3 * facts.focal.readout_s, 1e3 * facts.focal.readout_sigma_s
         out.append(f"rolling shutter: {ms:.1f} ± {sigma_ms:.1f} ms from the first row to the last")
     return out
+
+
+def _place_lines(place: PlaceFit, own: DepthCamera) -> list[str]:
+    mm, sigma_mm = 1e3 * own.T_color_depth[:3, 3], 1e3 * place.place_sigma_m
+    turn_deg = np.rad2deg(angles_of(own.T_color_depth[None, :3, :3])[0])
+    where = ", ".join(f"{x:.1f} ± {s:.1f}" for x, s in zip(mm, sigma_mm, strict=True))
+    late_ms = -1e3 * place.how.time_offset_s
+    return [
+        f"depth sits at {where} mm right of, below and ahead of colour",
+        f"it is turned by {turn_deg:.2f} ± {np.rad2deg(np.linalg.norm(place.turn_sigma_rad)):.2f}°",
+        f"its focal length is {own.camera.fx:.1f} ± {place.focal_sigma * own.camera.fx:.1f} px",
+        f"it is late by {late_ms:.1f} ± {1e3 * place.lag_sigma_s:.1f} ms",
+    ]
 
 
 def _report(found: RgbdCalibration, statements: list[str]) -> dict[str, Any]:
@@ -178,6 +220,18 @@ def _report(found: RgbdCalibration, statements: list[str]) -> dict[str, Any]:
         "pairs": 0 if focal is None else focal.pairs,
         "ends": 0 if edges is None else edges.ends,
         "statements": statements,
+        **({} if found.how.own is None else _place_report(found.place, found.how.own)),
+    }
+
+
+def _place_report(place: PlaceFit | None, own: DepthCamera) -> dict[str, Any]:
+    return {
+        "T_color_depth": own.T_color_depth.tolist(),
+        "depth_fx_px": own.camera.fx,
+        "turn_sigma_rad": None if place is None else place.turn_sigma_rad.tolist(),
+        "place_sigma_m": None if place is None else place.place_sigma_m.tolist(),
+        "depth_focal_sigma": None if place is None else place.focal_sigma,
+        "lag_sigma_s": None if place is None else place.lag_sigma_s,
     }
 
 

@@ -248,7 +248,7 @@ def _known_cameras(
 def _with_lens(
     choice: Choice, listing: Listing, frames: Frames, options: BagOptions, problems: Problems
 ) -> tuple[Choice, DepthCamera | None]:
-    """Return the choice with lens and place of depth that is not registered; without depth that nobody asked for.
+    """Return the choice with lens and place of depth that is not registered; without depth that was not asked for.
 
     Raises DataError where it was asked for and its calibration is none.
     """

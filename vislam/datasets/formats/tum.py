@@ -2,7 +2,7 @@
 
 Intrinsics are those that the benchmark publishes per camera (Sturm et al., "A benchmark for the evaluation of RGB-D
 SLAM systems", IROS 2012, and the page "file formats" beside it), unless the folder brings its own calibration. Depth is
-registered to colour, 5000 units per metre, unless `depth/sensor.yaml` says otherwise; the page's depth correction is
+registered to colour, 5000 units per metre, unless `depth/sensor.yaml` states others; the page's depth correction is
 already in the images. The accelerometer has no gyroscope beside it: it shows which way is up, and nothing else.
 """
 

@@ -2,5 +2,8 @@
 
 from vislam.datasets.rgbd.facts import RgbdFacts, rgbd_facts
 from vislam.datasets.rgbd.judgement import Known, RgbdFault, known, rgbd_faults, rgbd_findings
+from vislam.datasets.rgbd.place import PlaceFit, fit_place
 
-__all__ = ["Known", "RgbdFacts", "RgbdFault", "known", "rgbd_facts", "rgbd_faults", "rgbd_findings"]
+__all__ = [
+    "Known", "PlaceFit", "RgbdFacts", "RgbdFault", "fit_place", "known", "rgbd_facts", "rgbd_faults", "rgbd_findings",
+]  # fmt: skip

@@ -1,0 +1,165 @@
+"""Where depth with a lens of its own sits beside colour, how long its focal length is and how late it comes.
+
+Where foregrounds of registered depth end, the image has edges. Across every end the image's gradient is read; what is
+wrong with place, focal length and lag moves all ends by amounts that depend on where they are, how far and how fast.
+The parameters under which most gradient lies at the ends are searched, coarse to fine. Depth is registered again
+with what was found, three times. A shift of the principal point moves ends as a turn does, and is not distinguished.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.optimize import minimize
+
+from vislam.core.camera import Camera, Rig
+from vislam.core.geometry import se3_exp
+from vislam.core.jackknife import jackknife_variances
+from vislam.core.messages import Array, ImageF32, ImageU8
+from vislam.core.progress import Progress, silent
+from vislam.core.recording import Problems
+from vislam.datasets.images import DepthFormat
+from vislam.datasets.stream import Survey, frame_table, open_loader, with_depth_format
+from vislam.vision.depth_edges import foreground_ends
+from vislam.vision.depth_registration import DepthCamera
+
+_FRAMES = 80
+_ENDS = 300  # of a frame
+_ROUNDS = ((32, (8.0, 4.0)), (20, (4.0, 2.0)), (12, (2.0, 1.2)))  # px: reach of a profile, and blurs of it in turn
+_NORMAL_SIGMA_PX = 2.0
+_FLAT_GREY = 60.0  # gradients of a profile that count as much as this sum are noise
+# before anything is measured: turn in rad, place in m, focal length, lag in s, and by how many px foregrounds are wider
+_PRIOR = np.array([0.03, 0.03, 0.03, 0.05, 0.05, 0.03, 0.05, 0.04, 2.0])
+_WEIGHT = 0.05  # of an end against the prior: ends of one foreground err together
+_GROUPS = 12
+_WIDER = 3.0  # what all parts of a recording share (drawn scenes: up to 3 sigmas) no part shows that is left out
+_LEAST_FRAMES = 12
+_LEAST_ENDS = 2000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceFit:
+    """How depth is read as found, with sigmas by leaving out parts of the recording in turn (jackknife)."""
+
+    how: DepthFormat
+    turn_sigma_rad: Array  # [3]
+    place_sigma_m: Array  # [3]
+    focal_sigma: float  # relative, of depth
+    lag_sigma_s: float
+    ends: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ends:
+    """Ends of foregrounds in one frame: profiles [N, 2 R + 1] across them and what each parameter moves [N, 9] px."""
+
+    profiles: Array
+    moves: Array
+    given_px: Array  # [N] by which they are moved in any case, as depth and colour are stamped
+
+
+def fit_place(found: Survey, rig: Rig, progress: Progress = silent) -> PlaceFit | None:
+    """Find place, focal length and lag of depth with a lens of its own; None where too few foregrounds end.
+
+    Raises DataError when an image is not of the calibrated size.
+    """
+    how, frames = found.depth_format, list[_Ends]()
+    theta = np.zeros(len(_PRIOR))
+    for reach, blurs in _ROUNDS:
+        frames = _walk(with_depth_format(found, how), rig, reach, progress)
+        if len(frames) < _LEAST_FRAMES or sum(len(one.profiles) for one in frames) < _LEAST_ENDS:
+            return None
+        theta = np.zeros(len(_PRIOR))
+        for blur in blurs:
+            theta = _best(frames, blur, theta)
+        how = _changed(how, theta)
+    # the neighbours of a frame show the same ends: whole stretches are left out
+    groups = [frames[k * len(frames) // _GROUPS : (k + 1) * len(frames) // _GROUPS] for k in range(_GROUPS)]
+    parts = [[one for other in groups if other is not group for one in other] for group in groups]
+    sigma = _WIDER * np.sqrt(jackknife_variances(np.array([_best(part, _ROUNDS[-1][1][-1], theta) for part in parts])))
+    count = sum(len(one.profiles) for one in frames)
+    return PlaceFit(how, sigma[:3], sigma[3:6], float(sigma[6]), float(sigma[7]), count)
+
+
+def _changed(how: DepthFormat, theta: Array) -> DepthFormat:
+    assert how.own is not None
+    T = se3_exp(theta[:6]) @ how.own.T_color_depth
+    lens = how.own.camera.with_focal(1.0 + float(theta[6]))
+    return replace(how, own=DepthCamera(lens, np.asarray(T)), time_offset_s=how.time_offset_s - float(theta[7]))
+
+
+def _walk(found: Survey, rig: Rig, reach: int, progress: Progress) -> list[_Ends]:
+    frames = frame_table(found, Problems())
+    assert found.depth is not None
+    usable = np.flatnonzero(frames.depth_rows[:-1] >= 0)
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).astype(int))] if len(usable) else usable
+    out = []
+    flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    with closing(open_loader(found, rig, frames, 1)) as loader:
+        for n, i in enumerate(chosen.tolist()):
+            progress(n + 1, len(chosen), "place of depth")
+            here, there = loader.load(i), loader.load(i + 1)
+            if here.depth_m is None or not there.images:
+                continue
+            image = here.images[0]
+            flow = flow_of.calc(image, there.images[0], np.zeros((*image.shape, 2), np.float32))
+            speed = np.asarray(flow, np.float32) / np.float32((frames.t_ns[i + 1] - frames.t_ns[i]) * 1e-9)
+            delay_s = float(found.depth.t_ns[frames.depth_rows[i]] - frames.t_ns[i]) * 1e-9
+            out.append(_ends(rig.cameras[0], here.depth_m, image, speed, delay_s, reach))
+    return [one for one in out if len(one.profiles)]
+
+
+def _ends(camera: Camera, depth_m: ImageF32, image: ImageU8, speed: ImageF32, delay_s: float, reach: int) -> _Ends:
+    """Return ends of foregrounds in registered depth [H, W] with the image's gradient across them."""
+    pixels, inside = foreground_ends(depth_m)
+    pixels, inside = pixels[:: max(1, -(-len(pixels) // _ENDS))], inside[:: max(1, -(-len(pixels) // _ENDS))]
+    with np.errstate(divide="ignore"):
+        rho = np.where(depth_m > 0.0, 1.0 / depth_m, 0.0).astype(np.float32)
+    # what nothing was measured of beside a foreground lies behind it
+    smooth = cv2.GaussianBlur(rho, (0, 0), _NORMAL_SIGMA_PX)
+    u, v = pixels.T
+    normal = np.column_stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[v, u], cv2.Sobel(smooth, cv2.CV_32F, 0, 1)[v, u]])
+    normal = normal.astype(np.float64)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
+    grey = cv2.GaussianBlur(image, (0, 0), 1.0)
+    at = pixels[:, None, :] + normal[:, None, :] * np.arange(-reach, reach + 1.0)[:, None]
+    x, y = np.ascontiguousarray(at.reshape(-1, 2).T, dtype=np.float32)
+    slopes = [
+        cv2.remap(cv2.Sobel(grey, cv2.CV_32F, 1 - axis, axis), x, y, cv2.INTER_LINEAR).reshape(at.shape[:2])
+        for axis in (0, 1)
+    ]
+    profiles = np.abs(slopes[0] * normal[:, :1] + slopes[1] * normal[:, 1:])
+    profiles /= profiles.sum(axis=1, keepdims=True) + _FLAT_GREY
+    rays = camera.unproject(pixels.astype(np.float64))
+    J = np.einsum("ni,nij->nj", normal, camera.project_jacobian(rays))
+    velocity = speed[inside[:, 1], inside[:, 0]].astype(np.float64)  # of the foreground, to which the edge belongs
+    along = np.sum(normal * velocity, axis=1)
+    moves = np.column_stack([
+        np.cross(rays, J), J * rho[v, u][:, None], -np.sum(J[:, :2] * rays[:, :2], axis=1), along, np.ones(len(J)),
+    ])  # fmt: skip
+    usable = np.isfinite(moves).all(axis=1)
+    return _Ends(profiles[usable], moves[usable], (-along * delay_s)[usable])
+
+
+def _best(frames: list[_Ends], blur: float, start: Array) -> Array:
+    """Return the parameters [9] under which most gradient lies at the ends."""
+    profiles = np.vstack([one.profiles for one in frames]).astype(np.float32)
+    profiles = cv2.GaussianBlur(profiles, (2 * int(3 * blur) + 1, 1), blur, sigmaY=0.1, borderType=cv2.BORDER_REPLICATE)
+    moves = np.vstack([one.moves for one in frames]) * _PRIOR
+    given = np.concatenate([one.given_px for one in frames])
+    reach = profiles.shape[1] // 2
+    rows = np.arange(len(profiles))
+    weight = _WEIGHT / float(profiles.mean())
+
+    def cost(x: Array) -> tuple[float, Array]:
+        place = np.clip(given + moves @ x + reach, 0.0, 2.0 * reach - 1e-6)
+        left = place.astype(np.int64)
+        low, high = profiles[rows, left], profiles[rows, left + 1]
+        value = low + (high - low) * (place - left)
+        slope = np.where((place > 0.0) & (place < 2.0 * reach - 1e-5), high - low, 0.0)
+        return float(0.5 * x @ x - weight * value.sum()), x - weight * (slope @ moves)
+
+    return np.asarray(minimize(cost, start / _PRIOR, jac=True, method="L-BFGS-B").x) * _PRIOR
