@@ -12,8 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vislam import Config, Slam, open_source
-from vislam.core import Array, Frame
-from vislam.core.recording import MaskedRecording, Recording
+from vislam.core import Array, Frame, MaskedRecording, Recording
 from vislam.trajectory import Trajectory, evaluate
 
 WORLD = "sim:handheld-room,duration_s=8,camera_hz=10,image_width_px=320,moving_share=0.4"

@@ -10,9 +10,7 @@ from scipy.spatial import KDTree
 from vislam import Config, Slam
 from vislam.cli import run_verb
 from vislam.config import load
-from vislam.core.errors import DataError
-from vislam.core.messages import Frame, Observations
-from vislam.core.recording import MaskedRecording
+from vislam.core import DataError, Frame, MaskedRecording, Observations
 from vislam.frontend.masks import Masks
 from vislam.mapping.depth.stereo import DenseStereo
 from vislam.sim import open_world

@@ -56,6 +56,7 @@ SMALLEST = {
     "experiments/gtsam_drives.py": "--out out",
     "experiments/label_noise.py": "--hz 0.2 --width 64",
     "experiments/loop_precision_recall.py": "--sources points:laps,duration_s=4,tracks=60 --seeds 1 --out out",
+    "experiments/masks.py": "--shares 0.3 --seconds 3 --width 160",
     "experiments/moving_person.py": "--seconds 3 --width 64",
     "experiments/odometry_consistency.py": "{recording}",
     "experiments/plan_path.py": "{run} --out plan.png",

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
         VoMeasurement,
     )
     from vislam.core.readings import Reading
-    from vislam.core.recording import Problems
+    from vislam.core.recording import MaskedRecording, Problems, Recording
 
 __all__ = [
     "Array",
@@ -52,10 +52,12 @@ __all__ = [
     "Keyframe",
     "KeyframePacket",
     "MagSample",
+    "MaskedRecording",
     "NavState",
     "Observations",
     "Problems",
     "Reading",
+    "Recording",
     "Rig",
     "StageClock",
     "Tracking",
@@ -81,7 +83,7 @@ __getattr__ = late(
         "Observations Tracking VoMeasurement": "vislam.core.messages",
         "Camera Rig": "vislam.core.camera",
         "DataError UsageError VislamError": "vislam.core.errors",
-        "Problems": "vislam.core.recording",
+        "MaskedRecording Problems Recording": "vislam.core.recording",
         "Reading": "vislam.core.readings",
         "StageClock": "vislam.core.clock",
         "align_points invert level_rotation se3_exp se3_log sim3_parts so3_exp so3_log": "vislam.core.geometry",
