@@ -40,6 +40,7 @@ def error_m(source: str, seed: int) -> tuple[float, int, int]:
 
 
 def main() -> None:
+    """Print what each run came to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rig", default="rgbd", choices=["rgbd", "stereo"])
     parser.add_argument("--shares", type=float, nargs="+", default=[0.1, 0.4, 0.7])
