@@ -116,6 +116,8 @@ def _ends(camera: Camera, depth_m: ImageF32, image: ImageU8, speed: ImageF32, de
     """Return ends of foregrounds in registered depth [H, W] with the image's gradient across them."""
     pixels, inside = foreground_ends(depth_m)
     pixels, inside = pixels[:: max(1, -(-len(pixels) // _ENDS))], inside[:: max(1, -(-len(pixels) // _ENDS))]
+    if not len(pixels):
+        return _Ends(np.empty((0, 2 * reach + 1)), np.empty((0, len(_PRIOR))), np.empty(0))
     with np.errstate(divide="ignore"):
         rho = np.where(depth_m > 0.0, 1.0 / depth_m, 0.0).astype(np.float32)
     # what nothing was measured of beside a foreground lies behind it
