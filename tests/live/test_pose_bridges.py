@@ -322,7 +322,7 @@ def test_messages_are_those_of_ros_to_the_byte() -> None:
     from vislam.live.bridges import ros2
 
     pose = known_pose(health=Health.LEVELLED | Health.DEAD_RECKONING)
-    gid = ros2.Gid(list(range(ros2._GID_BYTES)))
+    gid = ros2.Gid(list(range(ros2.GID_BYTES)))
     node = ros2.NodeEntitiesInfo("/", "vislam", [], [gid, gid])
     for name, message in {
         "nav_msgs/msg/Odometry": ros2.odometry(pose, 5),

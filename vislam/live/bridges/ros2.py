@@ -52,7 +52,7 @@ KEPT = Qos(
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
 _DIAGNOSED_NS = _NS  # between diagnostics
-_GID_BYTES = 24 if os.environ.get("ROS_DISTRO") == "humble" else 16  # since Iron
+GID_BYTES = 24 if os.environ.get("ROS_DISTRO") == "humble" else 16  # since Iron
 _STATES = Health.LEVELLED | Health.VISION_OK | Health.AT_REST | Health.MAG_OK  # bits that are no fault
 OK, WARN, ERROR = range(3)
 
@@ -84,7 +84,7 @@ DiagnosticStatus = _message(
     "diagnostic_msgs", "DiagnosticStatus", level=byte, name=str, message=str, hardware_id=str, values=sequence[KeyValue]
 )
 DiagnosticArray = _message("diagnostic_msgs", "DiagnosticArray", header=Header, status=sequence[DiagnosticStatus])
-Gid = _message("rmw_dds_common", "Gid", data=array[uint8, _GID_BYTES])
+Gid = _message("rmw_dds_common", "Gid", data=array[uint8, GID_BYTES])
 NodeEntitiesInfo = _message(
     "rmw_dds_common", "NodeEntitiesInfo", node_namespace=bounded_str[256], node_name=bounded_str[256],
     reader_gid_seq=sequence[Gid], writer_gid_seq=sequence[Gid],
@@ -209,7 +209,7 @@ def _transforms(frames: Iterable[tuple[str, str, Matrix]], stamp_ns: int) -> Any
 
 
 def _gid(entity: Entity) -> Any:
-    return Gid(list(entity.guid.bytes.ljust(_GID_BYTES, b"\0")))
+    return Gid(list(entity.guid.bytes.ljust(GID_BYTES, b"\0")))
 
 
 def _time(t_ns: int) -> Any:
