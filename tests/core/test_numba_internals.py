@@ -50,6 +50,44 @@ def test_a_kernel_from_the_cache_has_no_module_and_the_same_answer(folder: Path)
     assert _ask(folder, script) == ["1.5", "1", "True"]
 
 
+CALLEE = """
+from vislam.core.jit import njit
+
+@njit(cache=True)
+def bent(x):
+    return {factor} * x
+"""
+CALLER = """
+from callee import bent
+from constants import OFFSET
+from vislam.core.jit import njit
+
+@njit(cache=True)
+def between(x):
+    return bent(x) + OFFSET
+
+@njit(cache=True)
+def outer(x):
+    return between(x)
+"""
+
+
+def test_a_kernel_is_compiled_again_where_another_file_that_it_stands_on_has_changed(folder: Path) -> None:
+    def ask() -> list[str]:
+        return _ask(folder, "import caller as c; print(c.outer(1.0), sum(c.outer.stats.cache_hits.values()))")
+
+    (folder / "caller.py").write_text(CALLER)
+    (folder / "constants.py").write_text("OFFSET = 1.0\n")
+    (folder / "callee.py").write_text(CALLEE.format(factor=2.0))
+    assert ask() == ["3.0", "0"]
+    assert ask() == ["3.0", "1"]
+    (folder / "callee.py").write_text(CALLEE.format(factor=20.0))  # of another size, as stamps of time may be coarse
+    assert ask() == ["21.0", "0"]
+    (folder / "constants.py").write_text("OFFSET = 5.00\n")
+    assert ask() == ["25.0", "0"]
+    assert ask() == ["25.0", "1"]
+
+
 def test_a_kernel_from_the_cache_can_be_inlined_into_one_that_is_compiled(folder: Path) -> None:
     half = ASK.format(kernel="half", arguments="3.0")
     area = ASK.format(kernel="area", arguments="3.0, 4.0")
@@ -62,6 +100,7 @@ def test_the_switch_leaves_numba_as_it_is(folder: Path, monkeypatch: pytest.Monk
     script = ASK.format(kernel="half", arguments="3.0")
     _ask(folder, script)
     monkeypatch.setenv("VISLAM_PLAIN_NUMBA", "1")
+    assert _ask(folder, script) == ["1.5", "0", "False"]  # it does not know our stamps
     assert _ask(folder, script) == ["1.5", "1", "False"]
 
 

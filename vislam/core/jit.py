@@ -7,17 +7,25 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Callable
 from typing import Any
 
 import numba
 from numba.core import config, event
 
-from vislam.core.numba_internals import replace_internals
+from vislam.core.numba_internals import replace_internals, stamp_with_callees
 
 
 def njit(**options: Any) -> Any:
     """Return numba's decorator for compiled functions, without the entry for C, which is never called."""
-    return numba.njit(no_cfunc_wrapper=True, **options)
+    decorate = numba.njit(no_cfunc_wrapper=True, **options)
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        kernel = decorate(function)
+        stamp_with_callees(kernel)
+        return kernel
+
+    return compiled
 
 
 class _Quicker(event.Listener):  # type: ignore[misc]

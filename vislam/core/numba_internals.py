@@ -4,15 +4,23 @@ Kernels come back from the cache as machine code alone; numba reads their LLVM m
 one run takes 40 MB and a third of a second, though only a kernel that inlines them and has to be compiled needs them.
 An assignment to a slice raises a constant text: numba 0.68 puts the shapes into it, for which it compiles its strings
 into every such kernel, a quarter of the time. Results are the same bytes with and without.
+
+A cached kernel is compiled again where a kernel that it calls, or a constant that either reads, has changed: numba
+looks at the kernel's own file alone, and would go on with the old code of another.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from functools import cache
+from types import CodeType, FunctionType
 from typing import Any
 
 import llvmlite.binding as llvm
-from numba.core import codegen
+import numpy as np
+from numba.core import caching, codegen
+from numba.core.dispatcher import Dispatcher
 from numba.extending import overload
 from numba.np import arrayobj
 
@@ -22,13 +30,63 @@ _module_for_linking = getattr(codegen.CPUCodeLibrary, "_get_module_for_linking",
 
 def replace_internals() -> None:
     """Replace what is there to be replaced, unless the switch is set; where a name is missing, numba's own stays."""
-    if os.environ.get("VISLAM_PLAIN_NUMBA", "0") not in ("", "0"):
+    if _is_plain():
         return
     if hasattr(arrayobj, "raise_with_shape_context"):
         arrayobj.raise_with_shape_context = _refuse_shapes
     if _read_both is not None and _module_for_linking is not None and hasattr(llvm, "ObjectFileRef"):
         codegen.CPUCodeLibrary._unserialize = classmethod(_read_code)
         codegen.CPUCodeLibrary._get_module_for_linking = _module_when_asked
+
+
+def stamp_with_callees(kernel: Any) -> None:
+    """Let what is cached of a kernel hold for what it calls and reads, too, as that is at the kernel's first call."""
+    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if isinstance(file, caching.IndexDataCacheFile) and "_source_stamp" in vars(file) and not _is_plain():
+        file.kernel = kernel
+        file.__class__ = _WithCallees
+
+
+class _WithCallees(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """The index of a kernel's cached versions, which holds for one stamp."""
+
+    @property
+    def _source_stamp(self) -> tuple[Any, ...]:
+        return vars(self)["_source_stamp"], *_called_and_read(self.kernel.py_func, set())
+
+
+_CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.generic)
+
+
+def _called_and_read(function: FunctionType, seen: set[FunctionType]) -> Iterator[Any]:
+    """Yield the stamps of the files of kernels that a function calls, directly or not, and what constants are."""
+    seen.add(function)
+    for name in sorted(_names(function.__code__)):
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher):
+            if value.py_func not in seen:
+                yield name, _file_stamp(value.py_func.__code__.co_filename)
+                yield from _called_and_read(value.py_func, seen)
+        elif isinstance(value, _CONSTANTS):
+            yield name, repr(value)
+        elif isinstance(value, np.ndarray):
+            yield name, str(value.dtype), value.shape, value.tobytes()
+
+
+def _names(code: CodeType) -> set[str]:
+    """Return the names that code and the functions in it look up."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names, inner))
+
+
+@cache
+def _file_stamp(path: str) -> tuple[int, int]:
+    status = os.stat(path)
+    return status.st_mtime_ns, status.st_size
+
+
+def _is_plain() -> bool:
+    return os.environ.get("VISLAM_PLAIN_NUMBA", "0") not in ("", "0")
 
 
 def _refuse_shapes(source: Any, goal: Any) -> None:
