@@ -21,7 +21,7 @@ import numpy as np
 
 from vislam.core import Problems
 from vislam.datasets import survey
-from vislam.datasets.calibration import camera_text
+from vislam.datasets.calibration_text import camera_text
 from vislam.datasets.rgbd import RgbdFacts, rgbd_facts, rgbd_faults
 from vislam.datasets.stream import Survey, frame_table
 

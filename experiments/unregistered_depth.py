@@ -22,7 +22,7 @@ import numpy as np
 import vislam
 from vislam.core.geometry import invert, so3_exp, so3_log
 from vislam.datasets import survey
-from vislam.datasets.calibration import camera_text, depth_keys_text
+from vislam.datasets.calibration_text import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat, read_depth
 from vislam.datasets.rgbd import fit_place
 from vislam.datasets.stream import Survey, with_depth_format

@@ -22,7 +22,7 @@ from vislam.core.geometry import se3_exp
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.datasets import open_dataset
 from vislam.datasets.calibrated import with_clock
-from vislam.datasets.calibration import camera_text, imu_text
+from vislam.datasets.calibration_text import camera_text, imu_text
 from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text, read_cameras
 from vislam.datasets.imu_files import (
     imu_calibration_text,

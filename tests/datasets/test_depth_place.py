@@ -12,7 +12,7 @@ import pytest
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.datasets import survey
-from vislam.datasets.calibration import camera_text, depth_keys_text
+from vislam.datasets.calibration_text import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.rgbd import fit_place
 from vislam.datasets.stream import with_depth_format

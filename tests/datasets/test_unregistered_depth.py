@@ -15,7 +15,8 @@ from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame
 from vislam.datasets import open_dataset, survey
-from vislam.datasets.calibration import depth_keys_text, parse_depth
+from vislam.datasets.calibration import parse_depth
+from vislam.datasets.calibration_text import depth_keys_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.inspect import inspect
 from vislam.vision.depth_registration import DepthCamera, DepthRegistration

@@ -80,8 +80,6 @@ class GraphConfig:
     read_newest: Count = 300  # poses that each keyframe reads back from the solver; up to this many plus a block: all
     read_block: Count = 200  # older poses that each keyframe reads back in turn, so that its work does not grow
 
-    gauge_sigma_m: NonNegative = 1e-3  # first position and yaw are a free choice: fixed far below what is measured
-    gauge_sigma_rad: NonNegative = 1e-3
     covariance_ratio_max: Positive = 1e6  # eigenvalue ratio of any factor; gtsam 4.3.0 throws above 1e7
 
     vo_inflation: Positive = 2.0  # mono, on sigma: what residuals miss, as neighbours err alike

@@ -17,7 +17,8 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.lens import Distortion
 from vislam.core.messages import Array
-from vislam.datasets.calibration import SIGMA_KEYS, Keys, list_text, numbers_in, parse_camera, read_pose, stated_lens
+from vislam.datasets.calibration import SIGMA_KEYS, Keys, numbers_in, parse_camera, read_pose, stated_lens
+from vislam.datasets.calibration_text import list_text
 from vislam.datasets.foreign_cameras import foreign_cameras, load_keys
 
 _MAX_CAMERAS = 2

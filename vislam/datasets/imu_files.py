@@ -15,7 +15,8 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.calibration import NOISE_KEYS, Keys, list_text, load_yaml, numbers_in, parse_noise
+from vislam.datasets.calibration import NOISE_KEYS, Keys, load_yaml, numbers_in, parse_noise
+from vislam.datasets.calibration_text import list_text
 from vislam.datasets.foreign_cameras import foreign_noise, load_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 

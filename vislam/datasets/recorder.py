@@ -24,7 +24,8 @@ from vislam.core.errors import DataError, StorageError, UsageError
 from vislam.core.geometry import quaternion_wxyz
 from vislam.core.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
 from vislam.core.recording import Problems, Recording
-from vislam.datasets.calibration import DEPTH_UNITS_PER_M, camera_text, depth_text, imu_text, pose_text
+from vislam.datasets.calibration import DEPTH_UNITS_PER_M
+from vislam.datasets.calibration_text import camera_text, depth_text, imu_text, pose_text
 from vislam.datasets.imu_files import imu_calibration_keys, mag_calibration_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 

@@ -84,7 +84,7 @@ class WindowOdometry:
         """See Odometry."""
         start = self._start
         assert start is not None
-        model = gaussian(pose_covariance(start, self._config), self._config.covariance_ratio_max)
+        model = gaussian(pose_covariance(start), self._config.covariance_ratio_max)
         prior = gtsam.PriorFactorPose3(X(0), gtsam.Pose3(start.T_map_body), model)
         bias = bias_of(start.gyro_bias_rad_s, start.accel_bias_m_s2)
         return [prior], Guess(start.T_map_body, start.velocity_map_m_s, bias)

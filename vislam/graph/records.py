@@ -71,7 +71,7 @@ class Records:
         those between the keyframes where they are at hand.
         """
         factors, _ = self.odometry.start()
-        factors += [held_pose(k, T, self._config) for k, T in self._held.items()]
+        factors += [held_pose(k, T) for k, T in self._held.items()]
         labels: list[Label | None] = [None] * len(factors)
         for step in self.steps(values) if steps is None else steps:
             factors += [*step.factors, *step.named.values()]

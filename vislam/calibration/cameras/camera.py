@@ -20,7 +20,7 @@ from vislam.config import WebcamConfig
 from vislam.core.angles import angle_deg
 from vislam.core.camera import CameraSigmas
 from vislam.core.messages import Array
-from vislam.datasets.calibration import camera_text
+from vislam.datasets.calibration_text import camera_text
 from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text
 
 _FILES = ("camchain.yaml", "camera.yaml", "camera_info.yaml", "camera.png", "camera.json")

@@ -22,7 +22,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.recording import Problems
 from vislam.datasets import survey
-from vislam.datasets.calibration import camera_text, depth_keys_text
+from vislam.datasets.calibration_text import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.rgbd import Known, PlaceFit, RgbdFacts, fit_place, known, rgbd_facts
 from vislam.datasets.stream import Survey, frame_table, with_depth_format

@@ -24,6 +24,7 @@ from vislam.core.messages import Array
 from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.factors.noise_models import gaussian
+from vislam.factors.priors import GAUGE_SIGMA
 from vislam.factors.solvers import FAILURES, Factorization, IncrementalSolver
 from vislam.factors.visual import pose_factor
 from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
@@ -291,7 +292,7 @@ class _SmallGraph:
         for count, k in enumerate(sorted(touched)):
             values.insert(X(k), gtsam.Pose3(self._chain.poses[k]))
             if before < 0:
-                gauge = gtsam.noiseModel.Isotropic.Sigma(6, self._config.gauge_sigma_rad)
+                gauge = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
                 factors.add(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(self._chain.poses[k]), gauge))
             else:
                 T, covariance = self._chain.motion(before, k)
