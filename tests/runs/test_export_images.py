@@ -11,11 +11,12 @@ import pytest
 
 from needs import missing
 from vislam.cli import run_verb
-from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
+from vislam.config import Config, FrontEndConfig, ImuConfig, MapConfig, ViewConfig
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert
 from vislam.core.messages import Frame, Submaps
+from vislam.core.recording import WrappedRecording
 from vislam.datasets.recorder import record
 from vislam.mapping.formats.ply import read_ply
 from vislam.runs import execute
@@ -39,11 +40,24 @@ LENSES = {
 }
 
 
+HEIGHT = 240
+
+
 def made(folder: Path, rig: str) -> Path:
     world = open_world("handheld-room", rig=rig, duration_s=5.0, camera_hz=10.0, image_width_px=320)
     record(world, folder / "recording")
     source, out = str(folder / "recording"), folder / "run"
-    config = Config(imu=ImuConfig(enabled=False), map=MapConfig(enabled=False), view=ViewConfig(enabled=False))
+    masks = folder / "masks"
+    masks.mkdir()
+    cv2.imwrite(
+        str(masks / "cam0.png"), np.repeat([255, 0], (HEIGHT - 40, 40)).astype(np.uint8)[:, None].repeat(320, 1)
+    )
+    config = Config(
+        frontend=FrontEndConfig(masks=str(masks)),
+        imu=ImuConfig(enabled=False),
+        map=MapConfig(enabled=False),
+        view=ViewConfig(enabled=False),
+    )
     prepare(out, False)
     execute(open_source(source, 0), config, out, source=source, command=["test"])
     return out
@@ -79,6 +93,7 @@ def test_colmap_reads_the_poses_cameras_and_errors_of_the_run(run: Path, tmp_pat
         image = by_name[exporting.image_name(found, i)]
         np.testing.assert_allclose(image.cam_from_world().matrix(), invert(T)[:3], atol=1e-9)
         pixels = cv2.imread(str(tmp_path / "out" / "images" / image.name))
+        assert (tmp_path / "out" / "masks" / f"{image.name}.png").is_file() == (found.camera[i] == 0)
         assert pixels.shape[1::-1] == (found.cameras[0].width, found.cameras[0].height)
     assert not list(tmp_path.glob(".*"))
 
@@ -134,10 +149,15 @@ def test_nerfstudio_gets_cameras_depth_and_points(run: Path, tmp_path: Path) -> 
         np.testing.assert_allclose(T[:3, 3], found.T_map_cam[i, :3, 3])
         assert (tmp_path / "out" / frame["file_path"]).is_file()
         depth_m = truth[found.camera_t_ns[i]].depth_m
+        assert ("mask_path" in frame) == (found.camera[i] == 0)
+        if found.camera[i] == 0:
+            mask = cv2.imread(str(tmp_path / "out" / frame["mask_path"]), cv2.IMREAD_GRAYSCALE)
+            assert mask[-40:].max() == 0 < mask[:-60].min()
         assert ("depth_file_path" in frame) == (depth_m is not None)
         if depth_m is not None:
             written = cv2.imread(str(tmp_path / "out" / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
-            np.testing.assert_allclose(written * whole["depth_unit_scale_factor"], np.nan_to_num(depth_m), atol=6e-4)
+            shown = np.where(mask > 0, np.nan_to_num(depth_m), 0.0)
+            np.testing.assert_allclose(written * whole["depth_unit_scale_factor"], shown, atol=6e-4)
 
 
 def test_points_lie_where_depth_is(run: Path) -> None:
@@ -200,11 +220,12 @@ def test_splats_are_those_of_the_map(run: Path, tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_recording_without_the_keyframes_is_named(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Empty:
-        def events(self):
+    class Empty(WrappedRecording):
+        def events(self, from_ns=None):
             return iter(())
 
-    monkeypatch.setattr(exporting, "open_source", lambda *_: Empty())
+    whole = Empty(open_source(str(run.parent / "recording"), 0))
+    monkeypatch.setattr(exporting, "open_source", lambda *_: whole)
     with pytest.raises(DataError, match=r"has no image at \d+ ns"):
         export_images(run, colmap=tmp_path / "out")
     assert list(tmp_path.iterdir()) == []

@@ -24,6 +24,7 @@ from vislam.core.files import write_json, write_text
 from vislam.core.geometry import invert, quaternion_wxyz
 from vislam.core.messages import Array, Frame
 from vislam.core.progress import Progress, silent
+from vislam.frontend.masks import Masks
 from vislam.mapping.formats.ply import write_ply
 from vislam.runs.folder import read_setup
 from vislam.runs.offline.posed_images import PosedImages, posed_images
@@ -59,8 +60,8 @@ def export_images(
 
     Args:
         run: the folder of the run; its recording is read again.
-        colmap: new folder for COLMAP: `images/`, `depth/`, and `sparse/0` as text.
-        nerfstudio: new folder for nerfstudio: `images/`, `depth/`, `transforms.json`, `points.ply`.
+        colmap: new folder for COLMAP: `images/`, `depth/`, `masks/`, and `sparse/0` as text.
+        nerfstudio: new folder for nerfstudio: `images/`, `depth/`, `masks/`, `transforms.json`, `points.ply`.
         poses: "graph", or NAME of a `trajectory_NAME.tum` of the run.
         undistort: resample images for pinhole cameras; depth as well.
         progress: takes what is done, of how much, and a note.
@@ -116,7 +117,7 @@ class _ImageWriter:
     def __init__(self, folders: list[Path], found: PosedImages, shown: PosedImages | None) -> None:
         """`shown` has the cameras to resample for, None to leave images as they are."""
         self.colors: NDArray[np.uint8] = np.full((len(found.points_m), 3), _GREY, np.uint8)
-        self.has_depth = np.zeros(len(found.keyframe), dtype=bool)
+        self.has_depth, self.has_mask = np.zeros((2, len(found.keyframe)), dtype=bool)
         self._folders, self._found = folders, found
         self._bounds = np.searchsorted(found.image, np.arange(len(found.keyframe) + 1))
         self._coloured = np.zeros(len(found.points_m), dtype=bool)
@@ -129,6 +130,7 @@ class _ImageWriter:
         """Take every image from the recording. Raises DataError where one is missing."""
         source, ran, _ = read_setup(run)
         recording = open_source(source, ran.seed, ran.calibration)
+        masks = Masks(ran.frontend.masks, recording.rig)
         waiting: dict[int, list[int]] = {}
         for i, t_ns in enumerate(self._found.camera_t_ns.tolist()):
             waiting.setdefault(t_ns, []).append(i)
@@ -139,8 +141,9 @@ class _ImageWriter:
             if isinstance(value, Frame) and (images := waiting.pop(value.t_ns, None)) is not None:
                 if not value.images:
                     raise DataError(f"{source} has points and no images: there is nothing to export")
+                masked = masks.onto(value)
                 for i in images:
-                    self._take(i, value)
+                    self._take(i, masked)
                 progress(total - len(waiting), total, "images")
         if waiting:
             raise DataError(
@@ -152,17 +155,23 @@ class _ImageWriter:
         side = int(self._found.camera[i])
         image = frame.color if side == 0 and frame.color is not None else frame.images[side]
         self._colour(i, image)
-        depth = None
+        depth, mask = None, frame.mask(side)
         if side == 0 and frame.depth_m is not None:
             units = np.nan_to_num(frame.depth_m, nan=0.0, posinf=0.0, neginf=0.0) / _DEPTH_UNIT_M
             depth = np.where(units < 2**16 - 0.5, np.rint(np.maximum(units, 0.0)), 0.0).astype(np.uint16)
             self.has_depth[i] = True
         if self._maps:
             image = np.asarray(cv2.remap(image, *self._maps[side], cv2.INTER_LINEAR))
-            depth = depth if depth is None else np.asarray(cv2.remap(depth, *self._maps[side], cv2.INTER_NEAREST))
+            depth, mask = (
+                None if one is None else np.asarray(cv2.remap(one, *self._maps[side], cv2.INTER_NEAREST))
+                for one in (depth, mask)
+            )
         self._write("images", i, image)
         if depth is not None:
             self._write("depth", i, depth)
+        if mask is not None:
+            self.has_mask[i] = True
+            self._write("masks", i, mask, ".png")  # after the image's own ending, where COLMAP looks for it
 
     def _colour(self, i: int, image: NDArray[np.uint8]) -> None:
         """Give points the colour of the first image that saw them."""
@@ -174,12 +183,12 @@ class _ImageWriter:
         self.colors[points] = seen[:, ::-1] if seen.ndim == 2 else seen[:, None]
         self._coloured[points] = True
 
-    def _write(self, kind: str, i: int, image: NDArray[np.generic]) -> None:
+    def _write(self, kind: str, i: int, image: NDArray[np.generic], ending: str = "") -> None:
         done, png = cv2.imencode(".png", image)
         if not done:
             raise DataError(f"the image of keyframe {self._found.keyframe[i]} cannot be written as PNG")
         for folder in self._folders:
-            path = folder / kind / image_name(self._found, i)
+            path = folder / kind / f"{image_name(self._found, i)}{ending}"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(png.tobytes())
 
@@ -258,6 +267,8 @@ def _write_nerfstudio(folder: Path, shown: PosedImages, model: str, writer: _Ima
         frame: dict[str, Any] = {"file_path": f"images/{name}"}
         if writer.has_depth[i]:
             frame["depth_file_path"] = f"depth/{name}"
+        if writer.has_mask[i]:
+            frame["mask_path"] = f"masks/{name}.png"
         frame |= _nerfstudio_lens(shown.cameras[shown.camera[i]])
         frames.append(frame | {"transform_matrix": (T @ _CAMERA_FROM_GL).tolist()})
     points: Array = shown.points_m
