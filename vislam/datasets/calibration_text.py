@@ -1,4 +1,4 @@
-"""Sensor files as they are written, in our keys: what `calibration.py` reads back to the same bits."""
+"""Sensor files as they are written, in our keys; reading them back gives the same bits."""
 
 from __future__ import annotations
 

@@ -129,7 +129,10 @@ class _ImageWriter:
     def read(self, run: Path, progress: Progress) -> None:
         """Take every image from the recording. Raises DataError where one is missing."""
         source, ran, _ = read_setup(run)
-        recording = open_source(source, ran.seed, ran.calibration)
+        try:
+            recording = open_source(source, ran.seed, ran.calibration)
+        except DataError as error:
+            raise DataError(f"{error}; images are read from the recording again, and a live run keeps none") from error
         masks = Masks(ran.frontend.masks, recording.rig)
         waiting: dict[int, list[int]] = {}
         for i, t_ns in enumerate(self._found.camera_t_ns.tolist()):
