@@ -77,6 +77,4 @@ def test_exit_codes(tmp_path, capsys, monkeypatch):
     assert run_verb(["posegraph", "walk.g2o"]) == 3
     assert "walk.g2o:" in capsys.readouterr().err
     assert run_verb(["posegraph", "absent.g2o"]) == 3
-    with pytest.raises(SystemExit) as left:
-        run_verb(["posegraph", "walk.g2o", "--method", "magic"])
-    assert left.value.code == 2
+    assert run_verb(["posegraph", "walk.g2o", "--method", "magic"]) == 2

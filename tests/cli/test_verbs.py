@@ -48,7 +48,10 @@ def help_of(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("verb", ["run", "live"])
+BRIEF = ("run", "live", "doctor", "record", "map")
+
+
+@pytest.mark.parametrize("verb", BRIEF)
 def test_the_short_help_fits_two_screens_and_explains_whatever_it_lists(
     verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -63,10 +66,30 @@ def test_the_short_help_fits_two_screens_and_explains_whatever_it_lists(
 
 
 def test_every_example_of_the_short_help_names_existing_options(capsys: pytest.CaptureFixture[str]) -> None:
-    for verb in ("run", "live"):
+    for verb in BRIEF:
         known = known_options(verb)[0]
         for example in import_module(f"vislam.cli.verbs.{verb}").BRIEF.examples:
             assert {word for word in example.split() if word.startswith("--")} <= {*known}
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("loops run --query 1 2", "Unrecognized options: --query, 1, 2"),
+        ("run x", "Missing from vislam run: --out PATH Folder to make for everything that the run leaves (required)"),
+        ("live --out", "Missing value for argument '--out'. Expected 1 values"),
+        ("map x --query 1 2 b", "--query: no type matching {None}|{FLOAT FLOAT FLOAT} could be instantiated from"),
+        (
+            "calibrate camera --model z a",
+            "invalid choice 'z' for argument '--model'. Expected one of ('auto', 'radtan',",
+        ),
+    ],
+)
+def test_wrong_arguments_are_one_line(typed: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_verb(typed.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    verb = " ".join(typed.split()[: 2 if typed.startswith("calibrate") else 1])
+    assert said in line and line.endswith(f"; vislam {verb} --help has the options") and "\u2502" not in line
 
 
 def test_the_long_help_has_all_settings(capsys: pytest.CaptureFixture[str]) -> None:

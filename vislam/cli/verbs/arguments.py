@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from contextlib import redirect_stderr
 from functools import cache, partial
+from io import StringIO
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,10 +42,25 @@ def parse(
 
     start = tyro.MISSING_NONPROP if default is None else default
     described = summary or VERBS[verb].summary
-    parsed = tyro.cli(options, prog=f"vislam {verb}", description=described, args=arguments, default=start)
+    said = StringIO()
+    try:
+        with redirect_stderr(said):
+            parsed = tyro.cli(options, prog=f"vislam {verb}", description=described, args=arguments, default=start)
+    except SystemExit as end:
+        if end.code:
+            raise UsageError(_in_one_line(said.getvalue(), verb)) from None
+        raise
     check_ranges(parsed)
     _announce_compilation(verb)
     return parsed
+
+
+def _in_one_line(box: str, verb: str) -> str:
+    """Return what the parser of arguments says, without the box that it draws around it, its title and its advice."""
+    _, *lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in box.splitlines()] or [""]
+    said = " ".join(line for line in lines if line and not line.endswith("--help"))
+    said = re.split(r" ?(?:Got errors:|Argument helptext:|For full helptext)", said)[0].rstrip(".")
+    return f"{said}; vislam {verb} --help has the options"
 
 
 @cache

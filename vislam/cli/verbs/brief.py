@@ -74,11 +74,14 @@ def said_of(setting: Setting) -> str:
 
 def flags_of(setting: Setting) -> tuple[str, ...]:
     """Return the options that set it: for yes and no two, nothing for an argument without a name."""
-    if any(repr(extra) == "Positional" for extra in getattr(setting.type, "__metadata__", ())):
+    extras = getattr(setting.type, "__metadata__", ())
+    if any(repr(extra) == "Positional" for extra in extras):
         return ()
     head, _, last = setting.option[2:].rpartition(".")
+    last = next((extra.name for extra in extras if getattr(extra, "name", None)), last)
     dot = "." if head else ""
-    return (setting.option, f"--{head}{dot}no-{last}") if _plain(setting.type) is bool else (setting.option,)
+    option = f"--{head}{dot}{last}"
+    return (option, f"--{head}{dot}no-{last}") if _plain(setting.type) is bool else (option,)
 
 
 def choices_of(hint: Any) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from vislam.cli.verbs.arguments import parse, take_path
+from vislam.cli.verbs.brief import Brief
 from vislam.cli.verbs.terminal import number, print_table, progress_bar
 from vislam.config import SensorsConfig, load_sensors
 from vislam.config.ranges import Range
@@ -49,12 +50,23 @@ class DoctorOptions:
 
 OPTIONS = (DoctorOptions,)
 TAKEN = {"--config FILE": "TOML file of sensors, as for record; options go before it"}
+BRIEF = Brief(
+    "[SOURCE] [options]",
+    (
+        "vislam doctor euroc:PATH",
+        "vislam doctor",
+        "vislam doctor --i2c /dev/i2c-1 --camera 0",
+        "vislam doctor --serial /dev/ttyUSB0",
+    ),
+    ("gy85.bus", "board.bus", "board.chip", "serial.baud", "webcam.device", "webcam.width_px"),
+    TAKEN,
+)
 
 
 def main(arguments: list[str]) -> int:
     """Examine a recording, or without one the sensors of this machine."""
     default = DoctorOptions(sensors=load_sensors(take_path(arguments, "--config")))
-    options = parse(DoctorOptions, arguments, "doctor", default)
+    options = parse(DoctorOptions, arguments, "doctor", default, BRIEF)
     return _examine_recording(options) if options.source else _examine_hardware(options)
 
 

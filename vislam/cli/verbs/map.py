@@ -11,6 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from vislam.cli.verbs.arguments import parse
+from vislam.cli.verbs.brief import Brief
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import MapConfig
 from vislam.config.ranges import Finite, Positive, Range
@@ -47,13 +48,27 @@ class MapOptions:
 
 
 OPTIONS = (MapOptions,)
+BRIEF = Brief(
+    "RUN|FILE.bt [options]",
+    (
+        "vislam map runs/desk --resolution-m 0.02 --products cloud octomap mesh",
+        "vislam map runs/desk --poses batch --out maps/desk",
+        "vislam map runs/desk/map/octomap.bt --query 1.0 2.0 0.5",
+        "vislam map runs/desk --nearest chair",
+    ),
+    (
+        "products", "resolution_m", "max_range_m", "cloud_voxel_m", "mesh_voxel_m", "surfel_m", "grid_low_m",
+        "grid_high_m", "labels.folder",
+    ),
+    {},
+)  # fmt: skip
 
 
 def main(arguments: list[str]) -> int:
     """Make the maps of a run again, or describe an OctoMap file; settings that are not given are those of the run."""
     run = next((Path(argument) for argument in arguments if Path(argument).is_dir()), None)
-    settings = MapConfig() if run is None or "--help" in arguments else _settings_of(run)
-    options = parse(MapOptions, arguments, "map", MapOptions(source=tyro.MISSING, settings=settings))
+    settings = MapConfig() if run is None or {"-h", "--help", "--help-all"} & {*arguments} else _settings_of(run)
+    options = parse(MapOptions, arguments, "map", MapOptions(source=tyro.MISSING, settings=settings), BRIEF)
     if options.nearest is not None:
         return _nearest(options, options.nearest)
     if not options.source.is_dir():

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from vislam.cli.verbs.arguments import parse, take_path
+from vislam.cli.verbs.brief import Brief
 from vislam.cli.verbs.terminal import rewritten_line
 from vislam.config import RecordConfig, SensorsConfig, load_cart
 from vislam.config.ranges import Positive
@@ -39,12 +40,27 @@ class RecordOptions:
 
 OPTIONS = (RecordOptions,)
 TAKEN = {"--config FILE": "TOML file of sensors, with tables [sensors.NAME] of further ones; options go before it"}
+BRIEF = Brief(
+    "--out RECORDING [options]",
+    (
+        "vislam record --out recordings/ride",
+        "vislam record --out recordings/ride --imu serial:/dev/ttyUSB0 --camera 0",
+        "vislam record --out recordings/ride --imu realsense --camera realsense,depth",
+        "vislam record --out recordings/still --camera none --seconds 3600",
+    ),
+    (
+        "gy85.bus", "gy85.rate_hz", "board.bus", "board.chip", "board.rate_hz", "serial.port", "serial.baud",
+        "webcam.device", "webcam.width_px", "webcam.exposure_s",
+        "calibration.camera", "calibration.imu",
+    ),
+    TAKEN,
+)  # fmt: skip
 
 
 def main(arguments: list[str]) -> int:
     """Record until the time is over or a signal comes."""
     sensors, further = load_cart(take_path(arguments, "--config"))
-    options = parse(RecordOptions, arguments, "record", RecordOptions(out=tyro.MISSING, sensors=sensors))
+    options = parse(RecordOptions, arguments, "record", RecordOptions(out=tyro.MISSING, sensors=sensors), BRIEF)
     from vislam.live.port_readings import PortReadings
     from vislam.runs.record import record
     from vislam.runs.recorded_readings import further_ports
