@@ -38,7 +38,7 @@ def test_an_example_runs(script, tmp_path):
 
 def test_every_example_is_in_the_readme():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(EXAMPLES) == 13
+    assert len(EXAMPLES) == 14
     assert [path.name for path in EXAMPLES if f"](examples/{path.name})" not in readme] == []
 
 
