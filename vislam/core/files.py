@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -34,6 +36,24 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             raise
         reason = error.strerror or error
         raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
+
+
+@contextmanager
+def partial_folder(path: Path) -> Iterator[Path]:
+    """Make a folder beside `path`, to write and rename from; what is left of it goes when the block ends.
+
+    Raises StorageError when it cannot be made, or the block cannot write.
+    """
+    folder = None
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent))
+        yield folder
+    except OSError as error:
+        reason = error.strerror or error
+        raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
+    finally:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

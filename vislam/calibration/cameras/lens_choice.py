@@ -14,15 +14,7 @@ from vislam.calibration.cameras.lens import LensFit, Model, fit_lens
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 
-_CANDIDATES: tuple[Model, ...] = (
-    "radtan",
-    "equidistant",
-    "radtan5",
-    "ucm",
-    "eucm",
-    "ds",
-    "omni",
-)  # the usual first
+_CANDIDATES: tuple[Model, ...] = ("radtan", "equidistant", "radtan5", "ucm", "eucm", "ds", "omni")  # the usual first
 _DECISIVE = 10.0  # of the criterion: very strong evidence (Kass and Raftery 1995)
 _LOST = 25.0  # squared sigmas at most that a corner costs
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from tyro.conf import Positional
 
@@ -77,13 +76,14 @@ def _images(options: ExportOptions) -> None:
 
 
 def _splats(run: Path, path: Path, poses: str) -> None:
+    from vislam.core.files import partial_folder
     from vislam.runs.offline.rebuild import map_settings, rebuild
 
     if path.exists():
         raise UsageError(f"--splats {path} exists; choose another name, or remove it")
     settings = replace(map_settings(run).map, products=("splats",))
-    with progress_bar("map", "steps") as bar, TemporaryDirectory(dir=path.parent, prefix=".splats-") as folder:
-        answer = rebuild(run, settings, Path(folder), poses, bar)
+    with progress_bar("map", "steps") as bar, partial_folder(path) as folder:
+        answer = rebuild(run, settings, folder, poses, bar)
         if "splats" not in answer["written"]:
             raise DataError(f"{run}: no splats: {answer['left_out']['splats']}")
         Path(answer["written"]["splats"]).replace(path)

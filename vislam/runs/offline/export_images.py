@@ -6,10 +6,8 @@ are those of `map`, in metres.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import write_json, write_text
+from vislam.core.files import partial_folder, write_json, write_text
 from vislam.core.geometry import invert, quaternion_wxyz
 from vislam.core.messages import Array, Frame
 from vislam.core.progress import Progress, silent
@@ -95,20 +93,17 @@ def export_images(
 @contextmanager
 def _new_folders(paths: list[Path]) -> Iterator[list[Path]]:
     """Make folders that appear under their names when the block ends well, and not at all when it does not."""
-    made: list[Path] = []
-    try:
-        for path in paths:
+    for path in paths:
+        try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            made.append(Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)))
+        except OSError as error:
+            raise StorageError(f"{path.parent} cannot be made: {error.strerror}; choose another folder") from error
+    with ExitStack() as stack:
+        made = [stack.enter_context(partial_folder(path)) for path in paths]
         yield made
         for folder, path in zip(made, paths, strict=True):
             folder.chmod(0o755)
             folder.rename(path)
-    except OSError as error:
-        raise StorageError(f"{paths[0]} cannot be written: {error.strerror}; free space or choose another") from error
-    finally:
-        for folder in made:
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 class _ImageWriter:

@@ -6,8 +6,6 @@ it from the beginning. The same run gives the same bytes.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +15,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from vislam.core.camera import Rig
-from vislam.core.errors import DataError, StorageError, UsageError
+from vislam.core.errors import DataError, UsageError
+from vislam.core.files import partial_folder
 from vislam.core.geometry import invert_many
 from vislam.core.messages import Array, NavState
 from vislam.factors import rig_from
@@ -222,11 +221,7 @@ def _bag(path: Path) -> Iterator[Writer]:
     """Open a bag that becomes the file `path` when the block ends well, and vanishes when it does not."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    try:
-        folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent))
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written: {error.strerror}; choose another folder") from error
-    try:
+    with partial_folder(path) as folder:
         bag = Writer(folder / path.stem, version=_VERSION, storage_plugin=StoragePlugin.MCAP)
         bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)  # of MCAP's chunks
         bag.open()
@@ -237,8 +232,3 @@ def _bag(path: Path) -> Iterator[Writer]:
             raise
         bag.close()
         (folder / path.stem / path.name).replace(path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
