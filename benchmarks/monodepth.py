@@ -122,8 +122,10 @@ def measure_accuracy(images: list[NDArray[np.uint8]], truth: NDArray[np.float32]
     depth = filter_.depth_m()
     smooth_m = np.abs(depth - truth)[depth > 0.0]
     print(f"{len(images) - 1} frames, Gaussian filter: {known.mean():.1%} of the pixels known")
-    print(f"  median error {1e3 * np.median(errors_m):.1f} mm, within 5 cm {np.mean(errors_m < 0.05):.1%}")
-    print(f"  smoothed     {1e3 * np.median(smooth_m):.1f} mm, within 5 cm {np.mean(smooth_m < 0.05):.1%}")
+    if known.any():
+        print(f"  median error {1e3 * np.median(errors_m):.1f} mm, within 5 cm {np.mean(errors_m < 0.05):.1%}")
+    if smooth_m.size:
+        print(f"  smoothed     {1e3 * np.median(smooth_m):.1f} mm, within 5 cm {np.mean(smooth_m < 0.05):.1%}")
     print(f"  CPU per frame: first {times[0]:.0f} ms, mean {np.mean(times):.0f}, last ten {np.mean(times[-10:]):.0f}")
 
 
@@ -153,6 +155,9 @@ def compare_variants(seed: int, paths: list[str], chosen: list[str]) -> None:
                 filter_.update(image, T)
             cpu_ms = 1e3 * (time.process_time() - start) / (len(views) - 1)
             known, rho = filter_.known, filter_.belief.rho
+            if not known.any():
+                print(f"{name:10s} {variant:22s} no pixel known, CPU {cpu_ms:.0f} ms", flush=True)
+                continue
             off = np.abs(1.0 / rho[known] - truth[known]) / truth[known]
             sigmas = np.abs(rho[known] - 1.0 / truth[known]) / np.sqrt(filter_.belief.variance[known])
             print(

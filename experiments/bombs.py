@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 import bz2
+import importlib
+import io
+import re
+import sqlite3
 import struct
+import sys
+import tempfile
+import zipfile
 import zlib
+from contextlib import closing
+from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -84,6 +93,89 @@ def mcap_bomb(rng: np.random.Generator) -> bytes:
     return _cut(bytes(out), rng)
 
 
+def message_bomb(rng: np.random.Generator, messages: list[tuple[str, str, bytes]]) -> bytes:
+    """Return an MCAP file of messages (topic, type, CDR), each packed by zstd, of which some go on with many zeros."""
+    zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    names = sorted({(topic, type_) for topic, type_, _ in messages})
+    out, share, left = bytearray(b"\x89MCAP0\r\n"), rng.random(), 2 * _MOST_UNPACKED
+    for k, (topic, type_) in enumerate(names):
+        out += _record(3, struct.pack("<H", k + 1) + _text(type_) + _text("ros2msg") + _text(""))
+        out += _record(4, struct.pack("<HH", k, k + 1) + _text(topic) + _text("cdr") + bytes(4))
+    for t_ns, (topic, type_, body) in enumerate(messages * int(10 ** rng.uniform(0, 2))):
+        more = bytes(int(10 ** rng.uniform(0, 7.5))) if rng.random() < share * 0.2 and left > 0 else b""
+        left -= len(more)
+        head = struct.pack("<HIQQ", names.index((topic, type_)), t_ns, t_ns, t_ns)
+        out += _record(5, head + zstd.compress(body + more))
+    return _cut(bytes(out), rng)
+
+
+def database_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
+    """Return a rosbag 2 in a database of which a table is a view without end, or has blobs of zeros."""
+    rows = (1, 10**4, 10**7, 10**12)[int(rng.integers(4))]
+    count = f"WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT {rows})"
+    columns = "id, name, type, serialization_format, offered_qos_profiles, type_description_hash"
+    what = (
+        ("ALTER TABLE messages RENAME TO m", f"CREATE VIEW messages AS {count} SELECT m.id, topic_id, timestamp, data "
+         "FROM m, n"),
+        ("ALTER TABLE topics RENAME TO t", f"CREATE VIEW topics AS {count} SELECT n.i AS {columns} FROM t, n"),
+        (f"UPDATE messages SET data = zeroblob({int(10 ** rng.uniform(0, 6.5))}) WHERE id % 5 = 1",),
+        (f"UPDATE topics SET name = printf('%.{int(10 ** rng.uniform(0, 6))}c', 'x')",),
+        [f"INSERT INTO topics SELECT id + {10**k}, name || {k}, {columns[10:]} FROM topics" for k in range(1, 13)],
+    )[int(rng.integers(5))]  # fmt: skip
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "a.db3"
+        path.write_bytes(sound)
+        with closing(sqlite3.connect(path)) as database:
+            for line in what:
+                database.execute(line)
+            database.commit()
+        return _cut(path.read_bytes(), rng)
+
+
+def archive_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
+    """Return an archive of arrays of which one is of many zeros, states another shape, or lies in itself."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(sound)) as there, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as made:
+        chosen = str(rng.choice(there.namelist()))
+        for name in there.namelist():
+            data = there.read(name)
+            if name == chosen and rng.random() < 0.5:
+                data += bytes(int(10 ** rng.uniform(0, 7.5)))
+            elif name == chosen:
+                rows, columns = 10 ** int(rng.integers(0, 18)), b" 32" * int(rng.integers(2))
+                shape = b"'shape': (%d,%s), }" % (rows, columns)
+                data = re.sub(rb"'shape': .*?}", shape, data[:128])[:127].ljust(127) + b"\n" + data[128:]
+            made.writestr(name, data)
+    return forged_numbers(rng, out.getvalue(), 200) if rng.random() < 0.2 else out.getvalue()
+
+
+def forged_numbers(rng: np.random.Generator, data: bytes, within: int) -> bytes:
+    """Return data of which numbers in the first bytes, of text or binary, are very large."""
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 4))):
+        written = list(re.finditer(rb"\d+", bytes(out[:within])))
+        if written and rng.random() < 0.7:
+            match = written[int(rng.integers(len(written)))]
+            out[match.start() : match.end()] = b"%d" % int(10 ** rng.uniform(0, 18.5))
+        elif out:
+            at, width = int(rng.integers(min(within, len(out)))), int(rng.choice([1, 2, 4, 8]))
+            value = int(min(2.0 ** rng.uniform(0, 8 * width), 2 ** (8 * width) - 1))
+            out[at : at + width] = value.to_bytes(width, str(rng.choice(["little", "big"])))
+    return _cut(bytes(out), rng) if rng.random() < 0.3 else bytes(out)
+
+
+def long_text(rng: np.random.Generator, sound: bytes) -> bytes:
+    """Return a table with very many rows or columns, a very long field, or one that goes on in the middle of it."""
+    lines = sound.split(b"\n")
+    at, count = int(rng.integers(len(lines))), int(10 ** rng.uniform(0, 5))
+    kind = int(rng.integers(5))
+    lines[at] = (
+        lines[at] + lines[at][-6:] * count, b"\n".join([lines[at]] * min(count, 20_000)), lines[at] + b"0" * count,
+        lines[at] + b"\r" * count, lines[at].replace(b" ", b" " * min(count, 20_000)),
+    )[kind]  # fmt: skip
+    return b"\n".join(lines)[: 2**22]
+
+
 def forged_image(rng: np.random.Generator, sound: bytes) -> bytes:
     """Return a PNG whose head states another size or kind, or one that unpacks to far more than it is."""
     width, height = (int(10 ** rng.uniform(0, 5.5)) for _ in range(2))
@@ -100,6 +192,10 @@ def forged_image(rng: np.random.Generator, sound: bytes) -> bytes:
 def _ros_record(fields: list[bytes], data: bytes) -> bytes:
     head = b"".join(struct.pack("<I", len(field)) + field for field in fields)
     return struct.pack("<I", len(head)) + head + struct.pack("<I", len(data)) + data
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
 
 
 def _record(kind: int, data: bytes) -> bytes:

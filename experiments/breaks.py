@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from faults.sensor_faults import BREAKS, FAULTS, FaultyRecording
 
 from vislam.config import Config, load, validated
 from vislam.core.errors import VislamError
@@ -32,7 +33,6 @@ from vislam.experiment.recordings import open_cached
 from vislam.runs import execute
 from vislam.runs.folder import prepare, read_metrics
 from vislam.runs.verdict import Evidence, judge
-from vislam.sim.faults.faults import BREAKS, FAULTS, FaultyRecording
 
 _WRONG = 3.0  # times the clean error
 _SPARED = 1.5  # times the clean error, where what is left suffices

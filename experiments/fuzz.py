@@ -310,7 +310,30 @@ def bomb_targets() -> list[Target]:
     def bag(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
         return {"a.bag": bombs.bag_bomb(rng)} if rng.random() < 0.5 else {"a.mcap": bombs.mcap_bomb(rng)}
 
+    def stored(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        if "drive.db3" in sound and rng.random() < 0.5:
+            return {"drive.db3": bombs.database_bomb(rng, sound["drive.db3"])}
+        return {"a.mcap": bombs.message_bomb(rng, messages)}
+
+    def numbers(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        return {
+            name: bombs.archive_bomb(rng, data) if name.endswith(".npz") else bombs.forged_numbers(rng, data, 400)
+            for name, data in sound.items()
+        }
+
+    def film(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        return sound | {"a.mp4": bombs.forged_numbers(rng, sound["a.mp4"][::-1], 2000)[::-1]}
+
+    def text(rng: np.random.Generator, sound: dict[str, bytes]) -> dict[str, bytes]:
+        return {name: bombs.long_text(rng, data) for name, data in sound.items()}
+
+    messages = _messages()
     return [
+        Target("message bomb", [bag for bag in _bags() if "drive.db3" in bag], _read_bags, made=stored),
+        Target("map bomb", _maps(), _read_maps, made=numbers),
+        Target("vocabulary bomb", _vocabularies(), _read_vocabularies, made=numbers),
+        Target("film bomb", [_film()], _survey_film, made=film),
+        Target("text bomb", [*_trajectories(), *_graphs()], _read_texts, made=text),
         Target("calibration bomb", _calibrations()[:4], _read_calibrations, made=calibration),
         Target("settings bomb", _settings(), _read_settings, made=settings),
         Target("image bomb", [_asl(), _tum(), _kitti()], _survey, made=recording),
@@ -379,12 +402,9 @@ def _trajectories() -> list[dict[str, bytes]]:
 
 
 def _read_trajectories(folder: Path) -> None:
-    from vislam.trajectory import evaluate, read_kitti, read_trajectory
+    from vislam.trajectory import evaluate, read_trajectory
 
-    if (folder / "times.txt").exists():
-        read_kitti(folder / "a.txt", folder / "times.txt")
-        return
-    for path in folder.iterdir():
+    for path in folder.glob("a.*"):
         trajectory = read_trajectory(path)
         evaluate(trajectory, trajectory, "se3")
 
@@ -490,6 +510,44 @@ def _write_bag(writer: Any, store: Any) -> None:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_, typestore=store)
             writer.write(connections[topic], t_ns, serialize(message, type_))
+
+
+def _messages() -> list[tuple[str, str, bytes]]:
+    """Return topic, type and bytes of the messages of such a bag."""
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    with tempfile.TemporaryDirectory() as name:
+        writer = Writer(Path(name) / "a", version=9, storage_plugin=StoragePlugin.MCAP)
+        _write_bag(writer, get_typestore(Stores.ROS2_HUMBLE))
+        with Reader(Path(name) / "a") as reader:
+            return [(one.topic, one.msgtype, bytes(data)) for one, _, data in reader.messages()]
+
+
+def _film() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "a.mp4"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 20, (16, 16))
+        for i in range(6):
+            writer.write(np.full((16, 16, 3), i, np.uint8))
+        writer.release()
+        return {"a.mp4": path.read_bytes(), "a.yaml": _SENSOR.replace(b"[8, 6]", b"[16, 16]")}
+
+
+def _survey_film(folder: Path) -> None:
+    from vislam.datasets import open_dataset
+    from vislam.datasets.inspect import inspect
+
+    inspect(f"video:{folder / 'a.mp4'}")
+    for _ in zip(range(50), open_dataset(f"video:{folder / 'a.mp4'}").events(), strict=False):
+        pass
+
+
+def _read_texts(folder: Path) -> None:
+    if any(path.suffix in (".g2o", ".toro", ".isam") for path in folder.iterdir()):
+        _optimize(folder)
+    else:
+        _read_trajectories(folder)
 
 
 def _read_bags(folder: Path) -> None:

@@ -112,11 +112,11 @@ def main() -> None:
             f"{name} {100.0 * float((found == truth).mean()):.1f} %"
             for name, found in (("fused", layer.labels), ("every pixel", by_pixel), ("no bound", by_keyframe))
         )
-        few = layer.total < 3
+        often = (layer.labels == truth)[layer.total >= 3]
         stored = sum(len(mapper.packed(k).labels_png) for k in range(len(frames))) / len(frames) / 1024
         print(
             f"{kind} {share:.0%}: {len(layer)} voxels, right: {shares}; "
-            f"seen by 3 or more {100.0 * float((layer.labels == truth)[~few].mean()):.1f} %; "
+            f"seen by 3 or more {f'{100.0 * often.mean():.1f} %' if often.size else 'none'}; "
             f"{len(layer.things)} things; {adding_ms:.1f} + {fusing_ms:.1f} ms of CPU, {stored:.1f} KiB per keyframe"
         )
 

@@ -129,9 +129,10 @@ def errors(true: Array, seen: Array) -> Errors:
         scale.append(np.linalg.norm(b[:3, 3]) / np.linalg.norm(a[:3, 3]))
         yaw.append(abs(heading_deg(a[:3, :3].T @ b[:3, :3])))
     last = true[0] @ invert(seen[0]) @ seen[-1]
-    end = float(np.linalg.norm((last - true[-1])[:2, 3]) / way[-1])
+    end = float(np.linalg.norm((last - true[-1])[:2, 3]) / (way[-1] if off else np.nan))
     end_yaw = heading_deg(true[-1][:3, :3].T @ last[:3, :3])
-    return Errors(float(np.mean(off)), float(np.mean(scale)), float(np.mean(yaw)), end, end_yaw)
+    means = (float(np.mean(values or [np.nan])) for values in (off, scale, yaw))  # NaN: shorter than a segment
+    return Errors(*means, end, end_yaw)
 
 
 def heading_deg(R: Array) -> float:

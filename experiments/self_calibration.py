@@ -17,10 +17,10 @@ from scipy.optimize import least_squares
 from vislam.calibration.kinds import KINDS
 from vislam.calibration.options import SelfOptions
 from vislam.config import CalibrationConfig, Config, FrontEndConfig
+from vislam.core import Array
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp
-from vislam.core.messages import Array
 from vislam.datasets.camera_files import read_cameras
 from vislam.runs import execute
 from vislam.runs.folder import prepare

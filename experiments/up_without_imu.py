@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
+from vislam.core import Array
 from vislam.core.angles import angle_deg
 from vislam.core.files import write_json
-from vislam.core.messages import Array
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.sources import open_source

@@ -5,25 +5,34 @@ import gc
 import os
 import shutil
 import signal
+import sys
 from contextlib import suppress
 from functools import lru_cache
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 from hypothesis import settings
+from hypothesis.internal.conjecture import providers
 
 from browser import FLAGS
 from needs import missing
+from vislam.config import CalibrationConfig
+from vislam.sim.scene import Scene
 from vislam.sim.worlds import simulation
+from worlds.mini_recording import IMU_YAML
+from worlds.shared import shared
 
 TESTS = Path(__file__).resolve().parent
 REPOSITORY = TESTS.parent
+sys.path.append(str(REPOSITORY / "experiments"))  # for what is tested of them
 QUICK = {line for line in (TESTS / "quick.txt").read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
 _LIBC = ctypes.CDLL(None)
 _LEFT_OPEN = 16  # by libraries, once
@@ -32,6 +41,7 @@ _M_MMAP_THRESHOLD, _MAPPED_BYTES = -3, 1 << 20
 # Compilation makes first examples slow, and a build must not fail by chance: fixed examples, no deadline.
 settings.register_profile("vislam", deadline=None, derandomize=True)
 settings.load_profile("vislam")
+providers.is_local_module_file = lambda _path: False  # or examples have constants of what the worker has imported
 
 cv2.setNumThreads(1)  # as in deterministic replay
 
@@ -57,11 +67,38 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("slow")
 
 
+def pytest_collection_finish() -> None:
+    """Take what is imported by now out of Python's search for garbage, which would walk through all of it each time."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture
+def noise(tmp_path: Path) -> CalibrationConfig:
+    path = tmp_path / "noise.yaml"
+    path.write_text(IMU_YAML)
+    return CalibrationConfig(imu_noise=str(path))
+
+
 @pytest.fixture(autouse=True, scope="session")
-def painted_once() -> Iterator[None]:
-    """Keep the newest simulated world: the tests of a file open one again and again."""
+def painted_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Paint each simulated world once for all workers, and keep the newest: a file's tests open one again and again."""
+    paint = simulation.painted
+
+    @lru_cache(maxsize=1)
+    def painted(build: Callable[..., Any], seed: int) -> Scene:
+        if not build.__module__.startswith("vislam."):
+            return paint(build, seed)
+
+        def make(folder: Path) -> None:
+            scene = paint(build, seed)
+            np.savez(folder / "scene.npz", **{field.name: getattr(scene, field.name) for field in fields(Scene)})
+
+        folder = shared(tmp_path_factory, f"painted-{build.__module__}-{build.__qualname__}-{seed}", make)
+        return Scene(**np.load(folder / "scene.npz"))
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "painted", lru_cache(maxsize=1)(simulation.painted))
+        patch.setattr(simulation, "painted", painted)
         yield
 
 

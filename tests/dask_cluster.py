@@ -3,22 +3,13 @@
 import json
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 
 import pytest
 
+from waiting import wait_for
+
 PATIENCE_S = 1800.0  # a busy machine is no failure; nothing waits so long otherwise
-
-
-def until(condition, what):
-    """Wait until a condition holds and return its value."""
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s:
-        if value := condition():
-            return value
-        time.sleep(0.02)
-    pytest.fail(f"waited in vain for {what}")
 
 
 @contextmanager
@@ -30,7 +21,7 @@ def dask_cluster(folder, names=("one", "two")):
     scheduler = _started("distributed.cli.dask_scheduler", options, folder / "scheduler.txt")
     processes = [scheduler]
     try:
-        until(lambda: file.is_file() and file.stat().st_size > 0, "the scheduler")
+        wait_for(lambda: file.is_file() and file.stat().st_size > 0)
         address = json.loads(file.read_text())["address"]
         workers = {name: _worker(address, name, folder) for name in names}
         processes += workers.values()

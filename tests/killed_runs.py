@@ -5,8 +5,6 @@ changes, and counted in them, not in seconds, the same seed kills at the same pl
 from one process that has compiled everything. Every line on stdout is a fact as JSON; a failed check ends it.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -4,8 +4,6 @@
 one does; `--only TEXT ...` takes those whose file or tests hold a text. The exit code is 1 where a mutant survives.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What a session is given with a keyframe, for tests that make one by hand."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

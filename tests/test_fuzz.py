@@ -32,7 +32,6 @@ _PATH = Path(__file__).resolve().parent.parent / "experiments" / "fuzz.py"
 _SPEC = importlib.util.spec_from_file_location("fuzz", _PATH)
 fuzz = importlib.util.module_from_spec(_SPEC)
 sys.modules["fuzz"] = fuzz  # dataclasses look their module up
-sys.path.append(str(_PATH.parent))  # for what lies beside it
 _SPEC.loader.exec_module(fuzz)
 
 

@@ -24,12 +24,12 @@ MOST_ATTRIBUTES = 20
 LONGEST_FILE, SHORTEST_FILE = 400, 30  # a shorter one that one file alone uses belongs to that one
 
 # Budgets: a commit that raises one says why. They are to fall to what stands beside them.
-BUDGET_PRODUCT_LINES = 121_793  # to 97,000
-BUDGET_TEST_LINES = 65_846  # to 49,000
-BUDGET_LONG_FILES = 13  # to 0
-BUDGET_WORDS = 41_324  # of README and docs/, as `wc -w` counts
+BUDGET_PRODUCT_LINES = 122_978  # to 97,000
+BUDGET_TEST_LINES = 67_427  # to 49,000
+BUDGET_LONG_FILES = 12  # to 0
+BUDGET_WORDS = 43_220  # of README and docs/, as `wc -w` counts
 BUDGET_WIDE_FUNCTIONS = 18  # of more than eight arguments; to 0
-BUDGET_BEHIND_DOORS = 2_086  # imports by experiments, benchmarks and tests of other rooms; falling
+BUDGET_BEHIND_DOORS = 2_063  # imports by experiments, benchmarks and tests of other rooms; falling
 BUDGET_PRIVATE_USES = 20  # of attributes with an underscore by tests
 
 # classes beyond the limit and how long they may be, by tens: one state machine each, whose parts share most attributes
@@ -40,7 +40,6 @@ LONG_CLASSES = {
     "Run": 320,
     "RunViewer": 290,
     "SerialBridge": 300,
-    "_Inspector": 270,
 }
 
 
@@ -83,7 +82,7 @@ def lines_of(folder: Path) -> dict[Path, int]:
     return {path: len(path.read_text(encoding="utf-8").splitlines()) for path in folder.rglob("*.py")}
 
 
-MAX_SETTINGS = 480  # of all sections together; only a commit that says why raises it
+MAX_SETTINGS = 468  # of all sections together; only a commit that says why raises it
 
 
 def top_names() -> list[str]:

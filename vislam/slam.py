@@ -6,8 +6,6 @@ frame           -> front end -> EKF                     -> keyframe?
 keyframe        -> loop detector -> graph -> mapper     -> poses in map, T_map_odom, map
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 from vislam.config import Config

@@ -9,6 +9,7 @@ from test_graph_gnc import _with_false_loops
 from test_graph_optimize import world
 
 from needs import missing
+from vislam.batch.posegraph import optimize
 from vislam.batch.posegraph.files import read_pose_graph
 from vislam.batch.posegraph.noise import covariances_of_edges, noise_of_kinds, rescaled
 from vislam.batch.posegraph.optimize import optimize_pose_graph
@@ -102,9 +103,8 @@ def test_loops_that_say_anything_are_not_believed_and_that_is_said():
     problem = _random_loops()
     loops = np.flatnonzero(np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1)
     solution = optimize_pose_graph(problem, AUTO)
-    odometry = problem.poses[:, :2, 2]
     assert solution.weights[loops].mean() < 0.05
-    away = np.linalg.norm(solution.poses[:, :2, 2] - odometry, axis=1)
+    away = np.linalg.norm(solution.poses[:, :2, 2] - problem.poses[:, :2, 2], axis=1)
     assert solution.weights[loops].any() or "undecided" in " ".join(solution.notes)
     assert solution.weights[loops].any() or away.max() < 1e-6
 
@@ -130,12 +130,10 @@ def test_residuals_show_by_how_much_the_noise_is_stated_wrongly():
         poses = optimize_pose_graph(problem).poses
         noise = noise_of_kinds(problem, poses)
         problem = rescaled(problem, noise)
-    assert [kind.kind for kind in noise] == [
-        "odometry rotation", "odometry translation", "loops rotation", "loops translation"
-    ]  # fmt: skip
+    kinds = ["odometry rotation", "odometry translation", "loops rotation", "loops translation"]
+    assert [kind.kind for kind in noise] == kinds
     ratio = problem.information / city.problem.information.clip(1e-300)
-    found = np.diagonal(ratio, axis1=1, axis2=2)
-    assert np.allclose(found, 1.0, atol=0.3)
+    assert np.allclose(np.diagonal(ratio, axis1=1, axis2=2), 1.0, atol=0.3)
 
 
 @pytest.mark.parametrize(("fraction", "robust", "hints"), [(0.0, "none", 0), (0.02, "none", 1), (0.8, "gnc", 1)])
@@ -173,12 +171,16 @@ def test_no_edge_gives_a_solution_more_than_it_says(d):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "share"), [("MIT", 1.0), ("M3500", 1.0), ("smallGrid3D", 1.0), ("intel", 0.98)])
-def test_clean_files_keep_their_loops(name, share, data_root):
+@pytest.mark.parametrize(("name", "share", "false"), [
+    ("MIT", 1.0, 0), ("MIT", 1.0, 80), ("M3500", 1.0, 0), ("smallGrid3D", 1.0, 0), ("intel", 0.98, 0),
+])  # fmt: skip
+def test_files_keep_their_loops_and_no_false_ones(name, share, false, data_root):
     problem = read_pose_graph(data_root / "g2o" / f"{name}.g2o")
-    plain, robust = optimize_pose_graph(problem), optimize_pose_graph(problem, AUTO)
-    loops = np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1
+    plain, robust = optimize_pose_graph(problem), optimize_pose_graph(_with_false_loops(problem, false, seed=2), AUTO)
+    loops = np.flatnonzero(np.abs(np.diff(problem.edges, axis=1)[:, 0]) != 1)
     assert robust.weights[loops].mean() >= share
+    assert not robust.weights[len(problem.edges) :].any()
+    assert any("chance may explain" in note for note in robust.notes) == (false > 0)
     d = problem.dimension
     ours, theirs = np.zeros((len(problem.ids), 3)), np.zeros((len(problem.ids), 3))
     ours[:, :d], theirs[:, :d] = robust.poses[:, :d, d], plain.poses[:, :d, d]
@@ -209,3 +211,20 @@ def test_lecture_hall_with_real_aliasing(true_loops, true_share, false_share, da
     ours[:, :2], real[:, :2] = solution.poses[:, :2, 2], truth[:, 1:3]
     T = align_points(ours, real)
     assert np.sqrt(np.mean(np.sum((ours @ T[:3, :3].T + T[:3, 3] - real) ** 2, axis=1))) <= 0.40
+
+
+def test_where_the_poses_that_decided_lead_nowhere_the_other_starts_are_solved(monkeypatch):
+    problem, _ = world(2, n=60, loops=30, seed=3)
+    config = PoseGraphConfig(robust="auto", iterations=5)
+    right, decide = optimize_pose_graph(problem, config), optimize._decision
+    thrown = np.random.default_rng(1).uniform(-np.pi, np.pi, 60)
+
+    def poses_thrown_about(*given):
+        decision = decide(*given)
+        poses = decision.poses.copy()
+        poses[1:, :2, :2] = np.array([[np.cos(thrown), -np.sin(thrown)], [np.sin(thrown), np.cos(thrown)]]).T[1:]
+        return replace(decision, poses=poses)
+
+    monkeypatch.setattr(optimize, "_decision", poses_thrown_about)
+    found = optimize_pose_graph(problem, config)
+    assert found.converged and found.costs[-1] == pytest.approx(right.costs[-1], rel=1e-6)

@@ -114,14 +114,10 @@ def test_a_cluster_without_workers_is_not_waited_for(tmp_path, monkeypatch):
             optimize_pose_graph(made.problem, team=team)
 
 
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [(PoseGraphConfig(method="dogleg"), "--method lm"), (PoseGraphConfig(start="tree"), "--start auto or file")],
-)
-def test_what_domains_cannot_is_refused(config, message):
+def test_what_domains_cannot_is_refused():
     made = simulate_graph("manhattan", replace(WORLD, poses=20))
-    with pytest.raises(VislamError, match=message):
-        optimize_pose_graph(made.problem, config, team=Alone())
+    with pytest.raises(VislamError, match="--start auto or file"):
+        optimize_pose_graph(made.problem, PoseGraphConfig(start="tree"), team=Alone())
     landmark = replace(made.problem, is_point=np.arange(20) == 19)
     with pytest.raises(VislamError, match="landmarks or priors"):
         optimize_pose_graph(landmark, team=Alone())

@@ -29,7 +29,7 @@ def seen_from(cameras, points, rng, sigma_px=0.0, with_depth=False):
     xy = c[:, :2] / c[:, 2:] + rng.normal(size=(len(c), 2)) * sigma_px / 400.0
     rho = 1.0 / c[:, 2] if with_depth else np.full(len(c), np.nan)
     n = len(c)
-    return Tracks(k, p, xy, np.full(n, 1 / 400.0), rho, np.full(n, 2e-3), np.zeros(n), np.zeros((n, 3)), len(points))
+    return Tracks(k, k, p, xy, np.full(n, 1 / 400.0), rho, np.full(n, 2e-3), np.zeros(n), np.zeros((n, 3)), len(points))
 
 
 def some_cameras(rng, count=6, step_m=0.2):
@@ -116,7 +116,7 @@ def test_the_factors_are_the_residuals_with_their_noise(rng):
     T_body_cam = se3_exp(rng.normal(size=6) * 0.3)
     noise = VisualNoise(0.8, 1.5, gtsam.noiseModel.mEstimator.Huber.Create(1e6))
     keep = rng.uniform(size=len(tracks)) < 0.9
-    factors = visual_factors(tracks, keep, with_depth, T_body_cam, noise)
+    factors = visual_factors(tracks, keep, with_depth, (T_body_cam,), noise)
     values = gtsam.Values()
     for k, T in enumerate(cameras):
         values.insert(X(k), gtsam.Pose3(T @ invert(T_body_cam)))

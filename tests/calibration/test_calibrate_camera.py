@@ -1,7 +1,5 @@
 """Cameras from views of a board: truth within honest sigmas, every kind of source, and refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +9,8 @@ import pytest
 from PIL import Image
 
 from vislam.calibration.cameras.board import Board, View
+from vislam.calibration.cameras.camera import choose_lens
 from vislam.calibration.cameras.lens import Model, direction_sigma_px, fit_lens, parameters_of
-from vislam.calibration.cameras.lens_choice import choose_lens
 from vislam.calibration.cameras.views import choose, live_images
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError, UsageError

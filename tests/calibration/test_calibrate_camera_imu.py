@@ -1,7 +1,5 @@
 """Rotation and time offset between camera and IMU from turns: simulated, real, and where motion does not tell."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calibration of a cart's floor: tilt and roll from the flow, height from a measured drive, and refusals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache

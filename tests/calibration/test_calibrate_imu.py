@@ -1,7 +1,5 @@
 """Twelve poses by hand: scale, axes and bias of an IMU with errors at the limits of its data sheet, and refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

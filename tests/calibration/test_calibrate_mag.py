@@ -1,7 +1,5 @@
 """Magnetometers: one turn of the cart, turns by hand, honest sigmas, and data that determine nothing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

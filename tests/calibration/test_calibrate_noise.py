@@ -1,7 +1,5 @@
 """Allan deviation: densities with honest sigmas, files that a run takes, and refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

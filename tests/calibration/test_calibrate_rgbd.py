@@ -1,7 +1,5 @@
 """`vislam calibrate rgbd`: what it writes is read back, and what a recording does not tell is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

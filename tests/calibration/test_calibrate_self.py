@@ -1,7 +1,5 @@
 """A lens from waving a camera about: exact worlds with noise, what motion does not show, and a real recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

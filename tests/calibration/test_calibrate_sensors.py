@@ -1,7 +1,5 @@
 """What a run found of its further sensors is what the next run begins with."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

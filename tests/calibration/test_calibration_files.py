@@ -1,7 +1,5 @@
 """Files of cameras, IMUs and magnetometers: what is written reads back, and a recording takes them."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Callable
@@ -271,6 +269,10 @@ def test_kalibrs_results_of_imus_are_read_and_what_is_not_used_is_named(caplog: 
     assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: Tw, time_offset"]
     with pytest.raises(DataError, match="holds 2 IMUs: imu0, imu1; give"):
         read_noise(written(f"imu0:\n  {block}imu1:\n  {block}"))
+    two = written(f"imu0:\n  {block}imu1:\n  {block}".replace("/imu0", "/left/imu", 1))
+    assert read_noise(two, "/left/imu") == read_noise(two, "/imu0") == NOISE
+    with pytest.raises(DataError, match="holds 2 IMUs: imu0, imu1, not one with rostopic /imu; give"):
+        read_noise(two, "/imu")
 
 
 def raw_recording(folder: Path, sensor_extra: str = "") -> Path:

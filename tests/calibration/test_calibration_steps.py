@@ -1,7 +1,5 @@
 """Calibration before a person: what each step says lacks, and that it ends with what the command line finds."""
 
-from __future__ import annotations
-
 import json
 from collections import deque
 from dataclasses import replace
@@ -183,6 +181,19 @@ def test_a_board_is_what_the_page_says() -> None:
 def test_a_source_without_what_a_step_needs_is_told(source: str) -> None:
     with pytest.raises(UsageError, match=r"nothing that a hand could move|no camera"):
         opened(RunSetup(source, Config(), SensorsConfig()), has_images=True)
+
+
+@pytest.mark.parametrize(
+    ("source", "offered"),
+    [
+        ("virtual-cart,bridge", set()),
+        ("gy85+none", {*STEPS} - {"camera"}),
+        ("gy85+webcam", {*STEPS}),
+        ("oak", {*STEPS}),
+    ],
+)
+def test_no_step_is_offered_that_would_be_refused(tmp_path: Path, source: str, offered: set[str]) -> None:
+    assert {*CalibrationSteps(Page(), RunSetup(source, Config(), SensorsConfig()), tmp_path).offered} == offered
 
 
 class Page:

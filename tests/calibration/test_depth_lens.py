@@ -1,7 +1,5 @@
 """The focal length that depth images tell, and recordings that have none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where a camera sits on the IMU by the accelerometer: exact motions with noise, and motion that does not show it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """What is calibrated before a run is what the run begins with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What vislam advises can be typed: every option in its messages exists, and takes what is written after it."""
 
-from __future__ import annotations
-
 import ast
 import re
 from functools import cache

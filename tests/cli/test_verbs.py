@@ -48,7 +48,7 @@ def help_of(verb: str, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out
 
 
-BRIEF = ("run", "live", "doctor", "record", "map")
+BRIEF = ("run", "live", "doctor", "record", "map", "drive")
 
 
 @pytest.mark.parametrize("verb", BRIEF)

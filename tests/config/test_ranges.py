@@ -1,7 +1,5 @@
 """Numbers among the settings have ranges: defaults lie inside, what lies outside is refused in one line."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from importlib import import_module

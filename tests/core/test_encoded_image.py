@@ -1,10 +1,9 @@
 """Images in files: sizes from their heads, and nothing decoded that states more than a camera has."""
 
-from __future__ import annotations
-
 import zlib
 
 import cv2
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,6 +44,14 @@ def test_an_image_that_states_more_than_any_camera_is_not_decoded(suffix: str) -
     assert image_size(huge) == (32_000, 32_000)
     assert decoded(huge, cv2.IMREAD_COLOR) is None
     assert decoded(data[:100], cv2.IMREAD_COLOR) is None
+
+
+def test_pixels_beyond_4k_need_bytes() -> None:
+    empty = cv2.imencode(".png", np.zeros((4096, 8192), np.uint8))[1].tobytes()
+    assert decoded(empty, cv2.IMREAD_GRAYSCALE) is None
+    assert decoded(empty + bytes(8192 * 4096 // 8), cv2.IMREAD_GRAYSCALE).shape == (4096, 8192)
+    dark = cv2.imencode(".jpg", np.zeros((2160, 3840), np.uint8))[1].tobytes()
+    assert decoded(dark, cv2.IMREAD_GRAYSCALE).shape == (2160, 3840)
 
 
 @pytest.mark.parametrize("suffix", [".bmp", ".webp", ".tiff", ".pgm"])

@@ -1,7 +1,5 @@
 """Every error of the package crosses from one process to another whole."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pkgutil

@@ -1,7 +1,5 @@
 """A signal ends whatever runs, at any moment; nothing hangs, and nothing left behind is in the way of the next try."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

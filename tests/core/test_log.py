@@ -1,7 +1,5 @@
 """log.txt of a run folder: what was logged and warned of, by every process, whatever happened."""
 
-from __future__ import annotations
-
 import logging
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """What a text asks for is bounded by its length: no aliases, dotted keys or nesting make much of little."""
 
-from __future__ import annotations
-
 import pytest
 
 from vislam.core.errors import DataError

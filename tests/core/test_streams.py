@@ -1,7 +1,5 @@
 """What is told of a stream: repeated, late and missing rows, steps of the clock, and nothing where nothing happened."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

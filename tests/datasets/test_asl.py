@@ -106,6 +106,23 @@ def test_unpaired_stereo_images_are_skipped_and_counted(tmp_path: Path) -> None:
     assert recording.problems == {"stereo image without partner": 2}
 
 
+@pytest.mark.parametrize("stereo", [True, False])
+def test_a_camera_that_looks_elsewhere_may_lack_images(stereo: bool, tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=5, stereo=stereo, rear=True)
+    rear = root / ("cam2" if stereo else "cam1")
+    edit_lines(rear / "data.csv", {2: None})
+    (rear / "data" / f"{BEGIN_NS + 3 * FRAME_NS}.png").write_text("no image")
+    recording = open_dataset(str(tmp_path))
+    frames = frames_of(recording)
+    assert recording.rig.is_stereo == stereo and recording.rig.further == (len(recording.rig.cameras) - 1,)
+    assert [(f.t_ns - BEGIN_NS) // FRAME_NS for f in frames] == [0, 1, 2, 3, 4]
+    assert [f.images[-1].size > 0 for f in frames] == [True, False, True, False, True]
+    assert all(image.size for f in frames for image in f.images[:-1])
+    assert [key.split(" (")[0] for key in recording.problems] == [
+        f"frame without an image of {rear.name}, or the reverse", "unreadable image",
+    ]  # fmt: skip
+
+
 def test_stereo_stamps_may_differ_by_little(tmp_path: Path) -> None:
     root = write_asl(tmp_path, frames=3)
     stamps = [BEGIN_NS + i * FRAME_NS for i in range(3)]

@@ -124,14 +124,19 @@ def test_two_frames_of_a_tree_of_transforms_are_a_trajectory(kind: str, tmp_path
         for k in range(COUNT)
         for t in [START_NS + k * 100_000_000]
     )
-    path = write_bag(tmp_path, kind, tree)
+    still = Message(START_NS, "/tf_static", types.transforms(START_NS, [("base_link", "imu", moved(2.0))]))
+    path = write_bag(tmp_path, kind, [*tree, still])
     found, words = trajectory_of_topic(path, "/tf:odom:/base_link")
     np.testing.assert_allclose(found.positions_m[:, 0], 0.1 * np.arange(COUNT))
     assert found.has_rotation and words.startswith("/tf:odom:/base_link, ") and "60 poses over 5.9 s" in words
+    found, _ = trajectory_of_topic(path, "/tf:map:imu")
+    wanted = [moved(5.0) @ moved(0.1 * k) @ moved(2.0) for k in range(COUNT)]
+    np.testing.assert_allclose(found.T_world_body, wanted, atol=1e-12)
     for name, told in (
         ("/tf", "topic=/tf: it holds transforms between many frames; name two: /tf:odom:base_link"),
-        ("tf:map:base_link", "no transform map:base_link on /tf; there are map:odom, odom:base_link"),
-        ("/tf:odom", "no transform odom on /tf; there are map:odom, odom:base_link"),
+        ("tf:base_link:map", "no transform base_link:map on /tf; there are base_link:imu, map:odom, odom:base_link"),
+        ("/tf:base_link:imu", "no transform base_link:imu on /tf"),  # which keeps still
+        ("/tf:odom", "no transform odom on /tf; there are base_link:imu, map:odom, odom:base_link"),
         ("/none:a:b", "topic=/none: no such topic"),
     ):
         with pytest.raises(DataError) as refused:

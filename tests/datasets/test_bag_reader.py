@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import get_types_from_msg
 
 from vislam.cli import run_verb
 from vislam.config import CalibrationConfig, FrontEndConfig
@@ -22,27 +21,10 @@ from vislam.datasets import open_dataset, survey
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.inspect import inspect
 from vislam.frontend import mode_for
-from worlds.bag_writer import KINDS, ROS2, Message, Types, from_asl, types_of, write_bag
+from worlds.bag_writer import KINDS, K, Message, from_asl, images_of, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, HEIGHT, IMU_YAML, WIDTH, picture, write_asl
 
-K = np.array([[50.0, 0.0, 31.5], [0.0, 51.0, 23.5], [0.0, 0.0, 1.0]])
 SIZE = (WIDTH, HEIGHT)
-
-
-@pytest.fixture
-def noise(tmp_path: Path) -> CalibrationConfig:
-    path = tmp_path / "noise.yaml"
-    path.write_text(IMU_YAML)
-    return CalibrationConfig(imu_noise=str(path))
-
-
-def images_of(types: Types, count: int = 3, **more: object) -> list[Message]:
-    """One camera alone, calibrated."""
-    out = [Message(BEGIN_NS, "/cam0/camera_info", types.info(BEGIN_NS, SIZE, K, "plumb_bob", [0.0] * 5))]
-    for i in range(count):
-        t_ns = BEGIN_NS + i * FRAME_NS
-        out.append(Message(t_ns, "/cam0/image_raw", types.image(t_ns, picture(i), "mono8", **more)))
-    return out
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -71,6 +53,26 @@ def test_a_bag_gives_what_its_folder_gives(kind: str, color: bool, tmp_path: Pat
             assert mine.accel_m_s2.tolist() == other.accel_m_s2.tolist()
     assert dict(bag.problems) == {}
     assert [event.t_ns for event in bag.events()] == [event.t_ns for event in ours]
+
+
+def test_further_cameras_of_a_bag_are_those_of_its_folder(tmp_path: Path, noise: CalibrationConfig) -> None:
+    mav0 = write_asl(tmp_path / "asl", rear=True)
+    path = write_bag(tmp_path, "mcap", from_asl(mav0, types_of("mcap")))
+    folder, bag = open_dataset(f"euroc:{mav0}"), open_dataset(f"bag:{path},further=/cam2/image_raw", noise)
+    assert bag.rig.cameras == folder.rig.cameras and bag.rig.further == (2,)
+    assert np.allclose(bag.rig.T_body_cams[2], folder.rig.T_body_cams[2], rtol=0.0, atol=1e-12)
+    pairs = zip(bag.events(), folder.events(), strict=True)
+    images = [(a.images[2], b.images[2]) for a, b in pairs if isinstance(a, Frame) and isinstance(b, Frame)]
+    assert len(images) == 6 and all(np.array_equal(a, b) for a, b in images)
+
+
+def test_of_several_imus_in_a_file_the_one_of_the_topic_is_taken(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", from_asl(write_asl(tmp_path / "asl"), types_of("mcap")))
+    block = IMU_YAML.replace("\n", "\n  ").rstrip()
+    other = block.replace("1.7e-04", "9e-3") + "\n  rostopic: /other\n"
+    (tmp_path / "imu.yaml").write_text(f"imu0:\n  {other}imu1:\n  {block}\n  rostopic: /imu0\n")
+    recording = open_dataset(str(path), CalibrationConfig(imu_noise=str(tmp_path / "imu.yaml")))
+    assert recording.imu_noise.gyroscope_noise_density == 1.7e-4
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -113,7 +115,8 @@ def test_topics_are_guessed_shown_and_told(tmp_path: Path, capsys: pytest.Captur
     ("options", "error", "words"),
     [
         ("imu=/imu1", DataError, "imu=/imu1: no such topic; of Imu there are /imu0"),
-        ("cam0=/imu0", DataError, "Image or CompressedImage is asked, it is sensor_msgs/msg/Imu"),
+        ("cam0=/imu0", DataError, "CompressedVideo or FFMPEGPacket is asked, it is sensor_msgs/msg/Imu"),
+        ("further=/cam0/image_raw", DataError, "/cam0/image_raw is named as two cameras"),
         ("camera=/x", UsageError, "no option 'camera'; there are: cam0"),
         ("stamps=wall", UsageError, "option stamps"),
         ("imu", DataError, "no recording"),
@@ -250,7 +253,7 @@ def test_images_of_webcams(encoding: str, grey_at: int, tmp_path: Path) -> None:
     pixels = np.full((HEIGHT, WIDTH, 2), 128, np.uint8)
     ramp = np.linspace(16, 235, WIDTH)
     pixels[..., grey_at] = ramp
-    messages = images_of(types, count=1)
+    messages = images_of(types, 1)
     messages[1] = Message(BEGIN_NS, "/cam0/image_raw", types.image(BEGIN_NS, pixels, encoding))
     (frame,) = open_dataset(str(write_bag(tmp_path, "mcap", messages))).events()
     assert np.allclose(frame.images[0], (ramp.astype(np.uint8) - 16.0) * 255.0 / 219.0, atol=1.5)
@@ -437,23 +440,6 @@ def test_a_bag_without_images_is_what_it_is(tmp_path: Path) -> None:
         open_dataset(str(path))
 
 
-def test_video_in_a_bag_is_named_and_an_imu_beside_it_does_not_hide_it(
-    tmp_path: Path, noise: CalibrationConfig
-) -> None:
-    kind = "foxglove_msgs/msg/CompressedVideo"
-    text = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
-    ROS2.register(get_types_from_msg(text, kind))
-    types = types_of("mcap")
-    stamp = types.header(BEGIN_NS, "").stamp
-    video = types.make(kind, timestamp=stamp, frame_id="cam0", data=np.zeros(9, np.uint8), format="h264")
-    messages = [Message(BEGIN_NS, "/video", video)]
-    messages += [Message(t, "/imu", types.imu(t, [0.1, 0, 0, 0, 0, 9.8])) for t in range(BEGIN_NS, BEGIN_NS + 40, 2)]
-    path = write_bag(tmp_path, "mcap", messages)
-    with pytest.raises(DataError, match=r"/video is video, which is not read: record CompressedImage.*cam0=none runs"):
-        open_dataset(str(path), noise)
-    assert open_dataset(f"{path},cam0=none", noise).rig.is_blind
-
-
 def test_cameras_that_transforms_put_at_one_place_are_named(tmp_path: Path) -> None:
     types = types_of("mcap")
     T = np.eye(4)
@@ -485,7 +471,7 @@ def test_truth_is_read_only_where_it_is_told(tmp_path: Path) -> None:
 
 def test_stamps_are_the_headers_and_where_they_are_zero_the_recorders(tmp_path: Path) -> None:
     types = types_of("mcap")
-    messages = images_of(types, count=4)
+    messages = images_of(types, 4)
     late = [Message(m.t_ns + 7_000, m.topic, m.value) for m in messages]
     path = write_bag(tmp_path, "mcap", late, name="late")
     assert [f.t_ns for f in open_dataset(str(path)).events()] == [BEGIN_NS + i * FRAME_NS for i in range(4)]

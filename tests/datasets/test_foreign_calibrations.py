@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,25 @@ ECHO = (
     "header:\n  stamp: {sec: 1, nanosec: 2}\n  frame_id: cam0\nheight: 48\nwidth: 64\ndistortion_model: plumb_bob\n"
     f"D: [-0.1, 0.01, 0.0001, 0.0002, 0.0]\nK: [{K_TEXT}]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nP: [1, 0]\nbinning_x: 0\n"
 )
+OKVIS = "imu_params:\n" + parts("  ", (1.7e-4, 2e-3, 1.9e-5, 3e-3), "sigma_g_c sigma_a_c sigma_gw_c sigma_aw_c")
+MAPLAB = "label: rig\ncameras:\n"
+for T, one in ((T0, FISHEYE), (T0 @ T01, RADTAN)):
+    k, kind = list(one.coefficients), one.distortion.replace("radtan", "radialtangential")
+    OKVIS += ("" if "cameras:" in OKVIS else "cameras:\n") + (
+        f"  - {{T_SC: {T.ravel().tolist()}, image_dimension: [64, 48], distortion_coefficients: {k},\n"
+        f"     distortion_type: {kind}, focal_length: [50.0, 51.0], principal_point: [31.5, 23.5]}}\n"
+    )
+    MAPLAB += (
+        f"- camera:\n    label: c\n    image_height: 48\n    image_width: 64\n    type: pinhole\n    intrinsics:\n"
+        f"      rows: 4\n      cols: 1\n      data: {list(PINHOLE)}\n    distortion:\n"
+        f"      type: {kind.replace('altan', 'al-tan')}\n      parameters: {{rows: 4, cols: 1, data: {k}}}\n"
+        f"  T_B_C: {{rows: 4, cols: 4, data: {T.ravel().tolist()}}}\n"
+    )
+MEI = Camera(*SIZE, 25.0, 25.5, *PINHOLE[2:], 0.0, "omni", (1.0, *FISHEYE.coefficients))
+T10, D_ROW = np.linalg.inv(T01), np.array([RADTAN.coefficients])
+PAIR = "%YAML:1.0\nimage_width: 64\nimage_height: 48\n"
+PAIR += "".join(matrix(f"M{k}", RADTAN.K) + matrix(f"D{k}", D_ROW) for k in (1, 2))
+PAIR += matrix("R", T10[:3, :3]) + matrix("T", T10[:3, 3:]) + matrix("Q", T0)
 BODY = matrix("IMU.T_b_c1", T0)
 STEREO = BODY + matrix("Stereo.T_c1_c2", T01)
 VINS = matrix("extrinsicRotation", T0[:3, :3])
@@ -127,12 +147,15 @@ R4, K4 = "k1 k2 p1 p2", "k1 k2 k3 k4"
         (basalt("ucm"), Camera(*SIZE, *PINHOLE, 0.0, "ucm", (0.6,)), [T0, T0 @ T01], 0.002),
         (basalt("eucm"), Camera(*SIZE, *PINHOLE, 0.0, "eucm", (0.6, 1.1)), [T0, T0 @ T01], 0.002),
         (vins_lens("MEI"), Camera(*SIZE, *PINHOLE, 0.0, "omni", (1.5, *RADTAN.coefficients)), [None], None),
+        (PAIR, RADTAN, [None, None], None),
         (opencv(D5), RADTAN, [None], None),
         (opencv(D8), RATIONAL, [None], None),
         (opencv(D4, more="fisheye_model: 1\n"), FISHEYE, [None], None),
         (XML, RADTAN, [None], None),
         (ECHO, RADTAN, [None], None),
-        (ECHO.replace("D:", "d:").replace("K:", "k:"), RADTAN, [None], None),
+        (ECHO.replace("D:", "d:").replace("K:", "k:") + "---\n", RADTAN, [None], None),
+        (f"mtx: [{K_TEXT}]\ndist: [[-0.1, 0.01, 1e-4, 2e-4, 0]]\nimageSize: [64, 48]\n", RADTAN, [None], None),
+        (opencv(D4, more="xi: 1.0\n"), MEI, [None], None),
     ],
 )  # fmt: skip
 def test_files_of_other_programs_are_read(
@@ -147,6 +170,38 @@ def test_files_of_other_programs_are_read(
         assert one.T_body_cam is None if T is None else one.T_body_cam == pytest.approx(T, abs=1e-12)
         assert one.time_offset_s == (None if offset_s is None else pytest.approx(offset_s))
     assert not caplog.records
+
+
+@pytest.mark.parametrize("text", [OKVIS, MAPLAB], ids=["OKVIS", "maplab"])
+def test_cameras_of_okvis_and_maplab_are_read_with_their_places(text: str, tmp_path: Path) -> None:
+    (tmp_path / "theirs.yaml").write_text(text)
+    found = read_cameras(tmp_path / "theirs.yaml")
+    assert [one.camera for one in found] == [FISHEYE, RADTAN]
+    assert found[0].T_body_cam == pytest.approx(T0) and found[1].T_body_cam == pytest.approx(T0 @ T01)
+
+
+@pytest.mark.parametrize(
+    ("text", "readout_s"),
+    [
+        (MAPLAB.replace("    label: c", "    line-delay-nanoseconds: 25000"), "0.0012"),
+        (vins_lens() + "rolling_shutter: 1\nrolling_shutter_tr: 0.033\n", "0.033"),
+    ],
+)
+def test_a_rolling_shutter_that_is_stated_is_named(
+    text: str, readout_s: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "theirs").write_text(text)
+    read_cameras(tmp_path / "theirs")
+    assert f"give --frontend.readout-s {readout_s}" in caplog.text
+
+
+def test_a_pair_of_opencv_has_its_place_there_or_in_the_file_beside(tmp_path: Path) -> None:
+    lenses, there, place = PAIR.partition("R: ")
+    (tmp_path / "intrinsics.yml").write_text(lenses)
+    with pytest.raises(DataError, match=r"extrinsics\.yml cannot be read"):
+        read_cameras(tmp_path / "intrinsics.yml")
+    (tmp_path / "extrinsics.yml").write_text("%YAML:1.0\n" + there + place)
+    assert read_cameras(tmp_path / "intrinsics.yml")[1].T_before_cam == pytest.approx(T01)
 
 
 def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
@@ -166,7 +221,12 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (basalt("fov"), "Basalt's camera model fov is not supported"),
         (basalt(T_cam_mocap=1.0), "meaning of T_cam_mocap is not known"),
         (basalt().replace('"px"', '"x"'), "looks like a file of Basalt.*no 'px'"),
-        (vins_lens("SCARAMUZZA"), "VINS's camera model SCARAMUZZA is not supported"),
+        (OKVIS.replace("equidistant", "fov"), "OKVIS's distortion fov is not supported"),
+        (MAPLAB.replace("equidistant", "fisheye"), "maplab's pinhole with fisheye is not supported"),
+        (MAPLAB.replace("type: pinhole", "type: omni"), "maplab's omni with equidistant is not supported"),
+        (PAIR.replace("image_width: 64\n", ""), "a pair of OpenCV; it has no image size: add image_width"),
+        (PAIR.replace(str(T10[0, 3]), "-120.0"), "a pair of OpenCV; T of 120 m is no pair's: write metres"),
+        (vins_lens("SCARAMUZZA").replace("projection", "poly"), "VINS's camera model SCARAMUZZA is not supported"),
         (vins_lens("MEI").replace("xi", "x"), "looks like a file of VINS.*no 'xi'"),
         (vins_lens().replace("fx", "f"), "looks like a file of VINS.*no 'fx'"),
         (vins_lens() + matrix("body_T_lidar", T0), "meaning of body_T_lidar is not known"),
@@ -174,8 +234,13 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (orb("PinHole", R4, RADTAN.coefficients, matrix("LEFT.K", T0)), "older settings with LEFT.K"),
         (orb("PinHole", R4, RADTAN.coefficients, "").replace("Camera.width: 64\n", ""), "ORB-SLAM.*no 'Camera.width'"),
         (orb("PinHole", R4, RADTAN.coefficients, matrix("IMU.T_b_c1", 2.0 * T0)), "not a rigid transform"),
-        (ECHO.replace("binning_x: 0", "binning_x: 2"), "binning is not read"),
-        (opencv(D5, size=""), "image_width"),
+        (ECHO.replace("binning_x: 0", "binning_x: 2"), "binning and parts of an image are not read"),
+        (ECHO + "roi: {x_offset: 9, y_offset: 0}\n", "binning and parts of an image are not read"),
+        (opencv(D5, size=""), "without image size; add image_width"),
+        (MAPLAB.replace("    label: c", "    time_offset: 0.1"), "meaning of time_offset is not known"),
+        (MAPLAB.replace("label: rig", "T_G_B: 1"), "meaning of T_G_B is not known"),
+        (OKVIS + "camera_parameters: {image_delay: 0.1}\n", "sign of OKVIS's image_delay is not known"),
+        ("# oST version 5.0 parameters\n", "is ROS's ost.txt; give its ost.yaml"),
         (XML.replace("<opencv_storage>", "<!DOCTYPE x><opencv_storage>"), "no document type"),
         (XML[:-20], "cannot be read as JSON or XML"),
         ("<svg></svg>", "holds <svg>"),
@@ -191,9 +256,9 @@ def test_what_cannot_be_used_is_refused_by_program_and_model(text: str, words: s
 
 def test_densities_of_other_programs_are_read_and_vins_has_none(tmp_path: Path) -> None:
     noise = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 200.0)
-    for text in (orb("PinHole", R4, RADTAN.coefficients, ""), basalt()):
+    for text in (orb("PinHole", R4, RADTAN.coefficients, ""), basalt(), OKVIS.replace("params", "parameters")):
         (tmp_path / "theirs").write_text(text)
-        assert read_noise(tmp_path / "theirs") == noise
+        assert read_noise(tmp_path / "theirs") == (noise if "imu_par" not in text else replace(noise, rate_hz=0.0))
     (tmp_path / "theirs").write_text(vins_lens() + VINS)
     with pytest.raises(DataError, match="acc_n and gyr_n are tuned"):
         read_noise(tmp_path / "theirs")

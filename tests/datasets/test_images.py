@@ -1,5 +1,6 @@
 """Images: sizes from headers, damage that decoders hide, matching by time, decoding ahead in order."""
 
+import re
 import threading
 from pathlib import Path
 
@@ -13,8 +14,11 @@ from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.datasets.images import (
     DepthFormat,
+    ImageList,
     UnreadableImageError,
+    bits_of,
     decode_ahead,
+    frames_ahead,
     match_by_time,
     probe,
     read_depth,
@@ -25,17 +29,22 @@ from worlds.mini_recording import HEIGHT, WIDTH, picture
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 50.0, 31.5, 23.5)
 
 
+def read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    images = ImageList("cam0", path.parent, np.zeros(1, np.int64), (path.name,))
+    return read_grey_or_color(images, 0, CAMERA, bits_of(images, CAMERA))
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_cut_image_is_unreadable_not_grey(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     cv2.imwrite(str(path), picture(1))
-    grey, color = read_grey_or_color(path, CAMERA)
+    grey, color = read(path)
     assert grey.shape == (HEIGHT, WIDTH) and color is None
     data = path.read_bytes()
     for kept in (0, 1, 30, len(data) // 2, len(data) - 3):
         path.write_bytes(data[:kept])
         with pytest.raises(UnreadableImageError, match="unreadable image"):
-            read_grey_or_color(path, CAMERA)
+            read(path)
         with pytest.raises(UnreadableImageError):
             probe(path)
 
@@ -47,7 +56,7 @@ def test_damage_in_the_middle_of_a_png_is_unreadable(tmp_path: Path) -> None:
     data[200:260] = bytes(60)
     path.write_bytes(data)
     with pytest.raises(UnreadableImageError):
-        read_grey_or_color(path, CAMERA)
+        read(path)
 
 
 def test_forged_size_is_refused_before_decoding(tmp_path: Path) -> None:
@@ -57,13 +66,13 @@ def test_forged_size_is_refused_before_decoding(tmp_path: Path) -> None:
     data[16:24] = (100_000).to_bytes(4, "big") * 2
     path.write_bytes(data)
     with pytest.raises(DataError, match=r"a.png is 100000x100000 but its calibration is for 64x48"):
-        read_grey_or_color(path, CAMERA)
+        read(path)
 
 
 def test_color_is_kept_and_made_grey(tmp_path: Path) -> None:
     image = picture(2, color=True)
     cv2.imwrite(str(tmp_path / "a.png"), image)
-    grey, color = read_grey_or_color(tmp_path / "a.png", CAMERA)
+    grey, color = read(tmp_path / "a.png")
     assert color is not None and np.array_equal(color, image)
     assert np.array_equal(grey, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
@@ -71,8 +80,28 @@ def test_color_is_kept_and_made_grey(tmp_path: Path) -> None:
 def test_sixteen_bit_grey_as_in_tum_vi(tmp_path: Path) -> None:
     image = picture(3).astype(np.uint16) * 256
     cv2.imwrite(str(tmp_path / "a.png"), image)
-    grey, color = read_grey_or_color(tmp_path / "a.png", CAMERA)
+    grey, color = read(tmp_path / "a.png")
     assert color is None and np.array_equal(grey, picture(3))
+
+
+def test_the_heat_of_a_scene_fills_the_eight_bits_alike_in_all_images(tmp_path: Path) -> None:
+    """One image is black, as while the shutter is closed, and one has the sun in it."""
+    scenes = [7000 + 6 * picture(seed).astype(np.uint16) for seed in range(20)]
+    scenes[3][:] = 0
+    scenes[5][:4, :4] = 65535
+    for i, scene in enumerate(scenes):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), scene)
+    images = ImageList("cam0", tmp_path, np.arange(20), tuple(f"{i}.png" for i in range(20)))
+    bits = bits_of(images, CAMERA)
+    reduced = np.array([read_grey_or_color(images, i, CAMERA, bits)[0] for i in range(20)])
+    low, high = (float(word) for word in re.findall(r"\d+", bits.said)[1:])
+    dark, bright = np.percentile(scenes[7], (1.0, 99.0))
+    assert dark - (bright - dark) < low < dark and bright < high < bright + (bright - dark)
+    expected = np.clip((np.array(scenes) - low) / (high - low) * 255.0, 0.0, 255.0)
+    assert np.abs(reduced - expected).max() < 1.0
+    (tmp_path / "1.png").unlink()
+    again = bits_of(images, CAMERA)
+    assert again.reduced(scenes[7]).shape == (HEIGHT, WIDTH) and again.said.startswith("; of 16 bits")
 
 
 def test_depth_is_metres_and_must_be_sixteen_bit(tmp_path: Path) -> None:
@@ -84,6 +113,16 @@ def test_depth_is_metres_and_must_be_sixteen_bit(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "e.png"), picture(1))
     with pytest.raises(UnreadableImageError, match="not 16-bit"):
         read_depth(tmp_path / "e.png", CAMERA, DepthFormat(5000.0))
+
+
+@pytest.mark.parametrize("size", [(640, 480), (3840, 2160), (8192, 4096)])
+@pytest.mark.parametrize("cameras", [1, 2, 8])
+def test_frames_that_are_held_at_once_take_128_mib_or_are_two(size: tuple[int, int], cameras: int) -> None:
+    camera = Camera(*size, 50.0, 50.0, 31.5, 23.5)
+    frame_bytes = (cameras + 3 + 4) * size[0] * size[1]
+    ahead = frames_ahead([camera] * cameras, camera)
+    assert ahead == 4 if size == (640, 480) else 0 <= ahead < 4
+    assert (ahead + 2) * frame_bytes <= 2**27 or ahead == 0
 
 
 def greedy(a: list[int], b: list[int], tolerance: int) -> dict[int, int]:

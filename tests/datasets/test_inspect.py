@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from test_other_formats import write_kitti, write_tum, write_video
 
+from vislam.config import CalibrationConfig
+from vislam.core import NO_IMAGE, Frame
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, UsageError
-from vislam.core.geometry import so3_exp, so3_log
+from vislam.core.geometry import invert, se3_exp, so3_exp, so3_log
+from vislam.datasets import open_dataset
 from vislam.datasets.camera_turns import fit_turns, follow_turns, judged_turns
 from vislam.datasets.inspect import Inspection, inspect
-from vislam.datasets.plausibility import epipolar_facts
+from vislam.datasets.rig_checks import judged_cameras
+from worlds.bag_writer import from_asl, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
+from worlds.room import ring
 
 
 def told(inspection: Inspection, severity: str, what: str) -> bool:
@@ -32,6 +37,17 @@ def test_a_sound_recording_has_streams_and_no_error(tmp_path: Path) -> None:
     assert told(result, "ok", "specific force 9.81 m/s^2 over")
     assert told(result, "ok", "every frame lies within the time of the IMU")
     assert told(result, "ok", "gravity is 0 deg from the vertical")
+
+
+def test_what_becomes_of_sixteen_bits_is_said(tmp_path: Path) -> None:
+    mav0 = write_asl(tmp_path / "folder", frames=20, stereo=False)
+    for path in (mav0 / "cam0" / "data").iterdir():
+        cv2.imwrite(str(path), 7000 + 6 * cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16))
+    for source in (tmp_path / "folder", write_bag(tmp_path, "mcap", from_asl(mav0, types_of("mcap")))):
+        assert told(inspect(str(source)), "ok", "decoded; of 16 bits")
+        noise = CalibrationConfig(imu_noise=mav0 / "imu0" / "sensor.yaml")
+        frames = [event for event in open_dataset(str(source), noise).events() if isinstance(event, Frame)]
+        assert len(frames) == 20 and all(30.0 < frame.images[0].std() < 80.0 for frame in frames)
 
 
 def test_every_fault_is_told_at_once(tmp_path: Path) -> None:
@@ -246,17 +262,32 @@ def test_turn_seen_by_camera_and_gyro() -> None:
     assert follow_turns(places, t_ns, lambda frame: [images[frame]] if frame % 4 else []) == []  # lost images
 
 
-def test_epipolar_check_tells_right_wrong_and_swapped() -> None:
-    left = turned_view(np.eye(3))
-    right = np.roll(left, -10, axis=1)  # everything at disparity 10 px: cam1 to the right of cam0
+def test_what_explains_a_pair_that_does_not_fit_is_tried() -> None:
+    T0, T01 = se3_exp(np.array([0.5, 0.3, -1.0, 0.3, -0.2, 0.1])), se3_exp(np.array([0.0, 0.1, 0.06, 0.1, 0.02, 0.0]))
+    R = T01[:3, :3]
+    left, right = turned_view(np.eye(3)), np.roll(turned_view(R), -10, axis=1)  # about as 2.5 m away
+    for T_body_cams, images, step in (
+        ((T0, T0 @ T01), (left, right), ""),
+        ((invert(T0), invert(T0 @ T01)), (left, right), "write the inverse of both T_BS ("),
+        ((T0, T0 @ invert(T01)), (left, right), "write the inverse of cam1's pose in cam0 or swap their images ("),
+        ((T0, T0 @ T01), (right, left), "write the inverse of cam1's pose in cam0 or swap their images ("),
+        ((T0, T0 @ T01), (left, np.rot90(right, 2).copy()), "check T_BS of both cameras"),
+    ):
+        (found,) = judged_cameras(Rig((CAMERA, CAMERA), T_body_cams), [images])
+        assert found.next_step.startswith(step) and (found.severity == "ok") == (not step), found
+        assert step or re.search(r"9\d % of (\d+) matches", found.what)
 
-    def facts(T_cam0_cam1: np.ndarray, pair: tuple[np.ndarray, np.ndarray]):
-        return epipolar_facts(Rig((CAMERA, CAMERA), (np.eye(4), T_cam0_cam1)), [pair])
 
-    T = np.eye(4)
-    T[0, 3] = 0.1
-    good = facts(T, (left, right))
-    assert good.matches > 60 and good.on_line > 0.9 and good.in_front > 0.9
-    assert facts(T, (right, left)).in_front < 0.2
-    T[:3, :3] = so3_exp(np.array([0.1, 0.0, 0.0]))
-    assert facts(T, (left, right)).on_line < 0.3
+def test_cameras_that_show_the_same_are_named_where_they_look_past_each_other() -> None:
+    rig = ring(180.0)
+    ahead, behind = (picture_of(k, rig.cameras[0]) for k in (1, 2))
+    assert [f.severity for f in judged_cameras(rig, [(ahead, behind)] * 3)] == ["ok"]
+    found = judged_cameras(rig, [(ahead, ahead)] * 3)
+    assert [f.severity for f in found] == ["error"] and "cam0 and cam1 show the same" in found[0].what
+    assert judged_cameras(rig, [(ahead, NO_IMAGE), ()])[0].severity == "ok"
+
+
+def picture_of(seed: int, camera: Camera) -> np.ndarray:
+    """Return an image that no other seed's looks like."""
+    noise = np.random.default_rng(seed).integers(0, 255, (camera.height // 8, camera.width // 8), dtype=np.uint8)
+    return cv2.resize(noise, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from vislam.core import Problems
-from vislam.core.messages import Frame, ImuSample
+from vislam.config import CalibrationConfig
+from vislam.core import Frame, ImuSample, Problems
 from vislam.core.streams import Happening
 from vislam.datasets import open_dataset, survey
+from vislam.datasets.camera_files import CameraCalibration, camchain_text
+from vislam.datasets.extrinsics import contradicted_extrinsics
 from vislam.datasets.inspect import inspect
 from vislam.datasets.stream_checks import StreamChecks
 from vislam.datasets.tables import in_time_order
@@ -70,6 +72,23 @@ def test_doctor_approves_of_euroc_and_refuses_inverted_extrinsics(data_root: Pat
     (root / "cam0" / "sensor.yaml").write_text(yaml.safe_dump(sensor))
     inverted = inspect(str(tmp_path))
     assert any(f.severity == "error" and "extrinsics or time stamps are wrong" in f.what for f in inverted.findings)
+    [told] = contradicted_extrinsics(open_dataset(str(tmp_path)))  # as a run that went wrong names it
+    assert "extrinsics or time stamps are wrong: with the inverse they differ by" in told
+
+
+def test_a_pair_whose_places_are_inverted_is_named_to_a_run_that_went_wrong(data_root: Path, tmp_path: Path) -> None:
+    recording = open_dataset(str(data_root / "euroc_mh01_17s"))
+    assert contradicted_extrinsics(recording) == ()
+    one, other = (
+        CameraCalibration(c, np.linalg.inv(T))
+        for c, T in zip(recording.rig.cameras, recording.rig.T_body_cams, strict=True)
+    )
+    chain = tmp_path / "chain.yaml"
+    chain.write_text(camchain_text((one, other), "inverted"))
+    told = contradicted_extrinsics(
+        open_dataset(str(data_root / "euroc_mh01_17s"), CalibrationConfig(camera=str(chain)))
+    )
+    assert "write the inverse of both T_BS" in told[0] and "cam0 and by the gyro differ" in told[1]
 
 
 def test_inertial_recordings_are_inspected(data_root: Path) -> None:

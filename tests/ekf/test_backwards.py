@@ -1,7 +1,5 @@
 """The tight filter backwards in time: a state found late gives metres to what was seen until then."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The filter: its linearisations, its gates, and that time of arrival does not matter."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from multiprocessing import Pipe
 

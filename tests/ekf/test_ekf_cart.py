@@ -1,7 +1,5 @@
 """What a filter knows of a cart: its axle goes neither sideways nor up, and its floor is level."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 

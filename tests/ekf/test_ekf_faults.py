@@ -1,7 +1,5 @@
 """The filter among broken sensors and clocks: everything wrong is refused with a reason and counted, nothing breaks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tight filter as a whole: accuracy, calibration, replay, faults, rest, and a real recording."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -98,7 +96,7 @@ def test_extrinsic_rotation_is_found() -> None:
 
 def test_calibration_can_be_switched_off() -> None:
     flight = Flight.make(1, 4.0)
-    ekf = flight.filter(tight_time_offset=False, tight_extrinsic_rotation=False)
+    ekf = flight.filter(tight_time_offset_sigma_s=0.0, tight_extrinsic_sigma_deg=0.0)
     for _ in flight.fly(ekf):
         pass
     found = ekf.calibration

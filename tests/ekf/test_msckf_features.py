@@ -1,14 +1,15 @@
 """The model of a track: derivatives, projection onto the nullspace, triangulation, propagation."""
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from vislam.core import Array, FurtherTracks, Observations
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, quaternion_wxyz, so3_log, transform
-from vislam.core.messages import Array, Observations
+from vislam.core.messages import no_observations
 from vislam.ekf.loose.kernels import pose
 from vislam.ekf.stretch import Stretch
 from vislam.ekf.tight import features, kernels
@@ -16,21 +17,16 @@ from vislam.ekf.tight.features import Sensor, Views
 from vislam.ekf.tight.kernels import Inertial
 from vislam.ekf.tight.state import CLONES, Window, cloned, moved, propagated, with_points, without_clone, without_points
 from vislam.ekf.tight.tracks import FrameTracks, prepare, ripe_tracks
-from worlds.flight import MONO, RGBD, STEREO
+from worlds.flight import MONO, REAR, RGBD, STEREO
 from worlds.motion import Motion
 from worlds.parts import GRAVITY_M_S2
 
 SIGMAS = np.array([0.8, 0.4, 2e-3])
 CLONE_TIMES_S = np.array([1.0, 1.3, 1.7, 2.2])
 POINT = np.array([5.0, 0.6, 0.3])
+BEHIND = np.array([-5.0, 0.6, 0.3])
 NO_IDS: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
 NOBODY = FrameTracks(0, NO_IDS, np.zeros((0, 2)), np.zeros((0, features.COLUMNS)), np.zeros(0, dtype=np.bool_))
-
-
-def rig_parts(rig: Rig) -> tuple[Array, Array, Array, Array]:
-    T = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
-    parts = rig.T_body_cams[0][:3, :3], rig.T_body_cams[0][:3, 3], T[:3, :3], T[:3, 3]
-    return tuple(np.ascontiguousarray(part) for part in parts)  # type: ignore[return-value]
 
 
 def a_window(motion: Motion, points: int = 0) -> tuple[Window, Array]:
@@ -76,44 +72,51 @@ def seen_from(
         if rig.has_depth:
             depth = np.array([y[2] * 1.01])
         seen = Observations(np.array([4]), pixel, right, depth, noise=noise)
+        for camera in rig.further:
+            y = invert(T @ rig.T_body_cams[camera])[:3] @ np.append(point, 1.0)
+            pixel = rig.cameras[camera].project(y[None]) + np.array([0.7, -0.4])
+            seen = replace(no_observations(), further=(FurtherTracks(camera, np.array([4]), pixel),))
         rows.append(prepare(0, seen, rig, readout_s).seen)
     return np.arange(len(rows)), np.concatenate(rows)
 
 
-def sensor(rig: Rig, sigmas: Array, R10: Array, t10: Array, focal: float = 1.0, metres: float = 1.0) -> Sensor:
-    return Sensor(*rig.lenses, sigmas, R10, t10, focal, metres)
+def sensor(rig: Rig, noise: float = 1.0, focal: float = 1.0, metres: float = 1.0) -> Sensor:
+    into = np.array([invert(T) for T in rig.T_cam0_cams])
+    R, t = np.ascontiguousarray(into[:, :3, :3]), np.ascontiguousarray(into[:, :3, 3])
+    return Sensor(rig.lenses, noise * SIGMAS, R, t, focal, metres)
+
+
+def poses_of(window: Window, rig: Rig, at: NDArray[np.int64], seen: Array) -> tuple[Array, Array]:
+    mount = np.ascontiguousarray(window.R_body_cam), rig.T_body_cams[0][:3, 3].copy()
+    return features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, mount, sensor(rig))
 
 
 def residuals(window: Window, rig: Rig, at: NDArray[np.int64], seen: Array, point: Array) -> Array:
-    R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
-    R_body_cam = np.ascontiguousarray(window.R_body_cam)
-    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    A, _, _ = features.linearise(
-        point, Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10, *window.scales), len(window.frames)
-    )
+    poses = poses_of(window, rig, at, seen)
+    A, _, _ = features.linearise(point, Views(at, seen, *poses), sensor(rig, 1.0, *window.scales), len(window.frames))
     return A[:, -1]
 
 
 @pytest.mark.parametrize("readout_s", [0.0, 0.03])
-@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD], ids=["mono", "stereo", "rgbd"])
+@pytest.mark.parametrize("rig", [MONO, STEREO, RGBD, REAR], ids=["mono", "stereo", "rgbd", "rear"])
 def test_derivatives_of_a_track(rig: Rig, readout_s: float) -> None:
     """By clones, extrinsic rotation and point, against differences of the residual through the filter's own moves."""
     window, x = a_window(Motion.random(5))
-    at, seen = seen_from(window, rig, readout_s, POINT)
-    R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
-    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    A, H_f, rows = features.linearise(POINT, Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10), len(at))
+    point = BEHIND if rig is REAR else POINT
+    at, seen = seen_from(window, rig, readout_s, point)
+    poses = poses_of(window, rig, at, seen)
+    A, H_f, rows = features.linearise(point, Views(at, seen, *poses), sensor(rig), len(at))
     assert rows == len(at) * (2 + 2 * rig.is_stereo + rig.has_depth)
     h = 1e-6
     for j in range(16, len(window.P)):
         change = np.zeros(len(window.P))
         change[j] = h
-        ahead = residuals(moved(window, x.copy(), change), rig, at, seen, POINT)
-        behind = residuals(moved(window, x.copy(), -change), rig, at, seen, POINT)
+        ahead = residuals(moved(window, x.copy(), change), rig, at, seen, point)
+        behind = residuals(moved(window, x.copy(), -change), rig, at, seen, point)
         np.testing.assert_allclose(A[:, j - 16], -(ahead - behind) / (2 * h), rtol=2e-5, atol=2e-4)
     for j in range(3):
         step = h * np.eye(3)[j]
-        ahead, behind = (residuals(window, rig, at, seen, POINT + s * step) for s in (1, -1))
+        ahead, behind = (residuals(window, rig, at, seen, point + s * step) for s in (1, -1))
         np.testing.assert_allclose(H_f[:, j], -(ahead - behind) / (2 * h), rtol=2e-5, atol=2e-4)
 
 
@@ -128,13 +131,10 @@ def test_noise_of_pixels_does_not_move_the_focal_length() -> None:
     whole = np.flatnonzero(np.all([camera.contains(np.nan_to_num(seen, nan=-1.0), 5.0) for seen in pixels], axis=0))
     noisy = pixels[:, whole] + SIGMAS[0] * rng.normal(size=(clones, len(whole), 2))
     rows = np.stack([prepare(0, Observations(whole, seen), MONO, 0.0).seen for seen in noisy])
-    R_body_cam, p_body_cam, R10, t10 = rig_parts(MONO)
     at, gradient, information = np.arange(clones), 0.0, 0.0
-    poses = features.camera_poses(
-        at, rows[:, 0], window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam
-    )
+    poses = poses_of(window, MONO, at, rows[:, 0])
     for k in range(len(whole)):
-        views, given = Views(at, np.ascontiguousarray(rows[:, k]), *poses), sensor(MONO, SIGMAS, R10, t10)
+        views, given = Views(at, np.ascontiguousarray(rows[:, k]), *poses), sensor(MONO)
         point, _, _ = features.triangulate(views, given)
         A, H_f, _ = features.linearise(point, views, given, clones)
         features.project_out(A, H_f)
@@ -150,10 +150,9 @@ def test_tracks_that_scatter_twice_as_much_count_as_if_told_so(rig: Rig) -> None
     window, _ = a_window(Motion.random(5))
     at, seen = seen_from(window, rig, 0.0, POINT)
     _, noisy = seen_from(window, rig, 0.0, POINT, noise=2.0)
-    R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
-    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    told = features.linearise(POINT, Views(at, seen, *poses), sensor(rig, 2.0 * SIGMAS, R10, t10), len(at))
-    shown = features.linearise(POINT, Views(at, noisy, *poses), sensor(rig, SIGMAS, R10, t10), len(at))
+    poses = poses_of(window, rig, at, seen)
+    told = features.linearise(POINT, Views(at, seen, *poses), sensor(rig, 2.0), len(at))
+    shown = features.linearise(POINT, Views(at, noisy, *poses), sensor(rig), len(at))
     for one, other in zip(told, shown, strict=True):
         np.testing.assert_allclose(one, other)
 
@@ -214,14 +213,13 @@ def test_triangulation_in_spite_of_an_outlier(rig: Rig) -> None:
     window, _ = a_window(motion)
     at, seen = seen_from(window, rig, 0.0, POINT)
     seen[:, 2:4] += rng.normal(size=(4, 2)) * 0.46
-    R_body_cam, p_body_cam, R10, t10 = rig_parts(rig)
-    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    point, rho, sigma = features.triangulate(Views(at, seen, *poses), sensor(rig, SIGMAS, R10, t10))
+    poses = poses_of(window, rig, at, seen)
+    point, rho, sigma = features.triangulate(Views(at, seen, *poses), sensor(rig))
     assert np.linalg.norm(point - POINT) < 0.15
     assert 0.0 < sigma < 0.3 * rho
     spoilt = seen.copy()
     spoilt[2, 2:4] += 37.0
-    robust, _, _ = features.triangulate(Views(at, spoilt, *poses), sensor(rig, SIGMAS, R10, t10))
+    robust, _, _ = features.triangulate(Views(at, spoilt, *poses), sensor(rig))
     assert np.linalg.norm(robust - point) < 0.3
 
 
@@ -262,9 +260,8 @@ def test_yaw_and_position_stay_unobservable() -> None:
     """Turning and moving everything together is invisible to tracks and points, whatever the estimates are."""
     window, x = a_window(Motion.random(10), points=2)
     at, seen = seen_from(window, MONO, 0.0, POINT)
-    R_body_cam, p_body_cam, R10, t10 = rig_parts(MONO)
-    poses = features.camera_poses(at, seen, window.R, window.p, window.rate, window.velocity, R_body_cam, p_body_cam)
-    A, H_f, _ = features.linearise(POINT, Views(at, seen, *poses), sensor(MONO, SIGMAS, R10, t10), len(at))
+    poses = poses_of(window, MONO, at, seen)
+    A, H_f, _ = features.linearise(POINT, Views(at, seen, *poses), sensor(MONO), len(at))
     features.project_out(A, H_f)
     blind = np.zeros((len(window.P) - 3 * 2 - 16, 4))
     for i in range(len(at)):

@@ -1,7 +1,5 @@
 """A filter that is too sure believes good fixes again; what leaps, lies a while or is contradicted does not pass."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

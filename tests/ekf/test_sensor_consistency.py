@@ -3,8 +3,6 @@
 Runs are those of `worlds.sensed_paths`, without vision unless said; every value has its band of 99.9 %.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

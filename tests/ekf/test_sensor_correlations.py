@@ -1,7 +1,5 @@
 """Own variables share their errors with the rest of the state, through clones, points and vision of every kind."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np
@@ -13,7 +11,7 @@ from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, Reading
 from vislam.ekf import CameraCalibration, Ekf, MsckfEkf
 from vislam.ekf.filtering import Filtering
-from vislam.ekf.tight.own_variables import by_now
+from vislam.ekf.tight.core import by_now
 from vislam.ekf.tight.state import CLONES
 from vislam.sensors import BodyState, Sensor, Suite, Variable
 from worlds import monte_carlo as mc
@@ -54,7 +52,9 @@ def test_a_marked_place_stays_the_clone_that_was_taken_there(rig) -> None:
     """
     flight = Flight.make(2, 4.0, rig, sigmas=0.1 * SIGMAS, outliers=0.05)
     suite = Suite({"mark": Mark(), "speed": Speed()})
-    config = load(None, {"ekf.coupling": "tight", "ekf.tight_time_offset": False}).ekf  # a mark is by the IMU's clock
+    config = load(
+        None, {"ekf.coupling": "tight", "ekf.tight_time_offset_sigma_s": 0.0}
+    ).ekf  # a mark is by the IMU's clock
     ekf = MsckfEkf(config, CHEAP, MACHINE, rig, suite)
     ekf.initialise(flight.start)
     marked_ns, compared, i, most = 0, 0, 0, 0.0

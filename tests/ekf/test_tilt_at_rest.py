@@ -1,7 +1,5 @@
 """At rest nothing tells tilt from the accelerometer's bias, so however long it lasts neither may become surer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Readings that err together are noticed by what the filter finds them off by, with a value; others are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

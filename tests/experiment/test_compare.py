@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from tiny import PLAN, jobs_here, write_plan
@@ -14,6 +13,7 @@ from tiny import PLAN, jobs_here, write_plan
 from vislam.cli import run_verb
 from vislam.experiment.recordings import open_cached
 from vislam.experiment.store import ResultStore
+from waiting import wait_for
 
 pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
 
@@ -49,17 +49,15 @@ def compared(folder):
         # children of a background job ignore the signal unless told otherwise
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s and first.poll() is None:
-        if (folder / "r.db").is_file():
-            with ResultStore(folder / "r.db") as store:
-                if len(store):
-                    break
-        time.sleep(0.05)
+
+    def count() -> int:
+        with ResultStore(folder / "r.db") as store:
+            return len(store)
+
+    wait_for(lambda: first.poll() is not None or ((folder / "r.db").is_file() and count()))
     first.send_signal(signal.SIGINT)
     _, said = first.communicate(timeout=PATIENCE_S)
-    with ResultStore(folder / "r.db") as store:
-        kept = len(store)
+    kept = count()
     with jobs_here():
         assert run_verb(arguments(folder, "--workers", "2")) == 0
     return first.returncode, said, kept

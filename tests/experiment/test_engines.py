@@ -11,7 +11,7 @@ import psutil
 import pytest
 from tiny import write_plan
 
-from dask_cluster import PATIENCE_S, dask_cluster, until
+from dask_cluster import PATIENCE_S, dask_cluster
 from vislam.core.errors import UsageError
 from vislam.experiment.engines import run_locally, run_on_dask
 from vislam.experiment.isolated import run_isolated
@@ -19,6 +19,7 @@ from vislam.experiment.jobs import expand
 from vislam.experiment.plan import load_plan
 from vislam.experiment.store import ResultStore
 from vislam.experiment.worker import run_job
+from waiting import wait_for
 
 
 @pytest.fixture
@@ -50,7 +51,7 @@ def test_a_crash_and_a_timeout_are_results_with_reasons(specs, tmp_path):
 
 def test_a_killed_job_says_by_what(specs, tmp_path):
     thread, box = in_thread(lambda: run_isolated(specs[0], str(tmp_path)))
-    until(lambda: workers_of(psutil.Process()), "the job to start")[0].kill()
+    wait_for(lambda: workers_of(psutil.Process()))[0].kill()
     thread.join()
     assert box[0]["reason"].startswith("crash: killed by SIGKILL")
 
@@ -88,10 +89,10 @@ def test_no_job_outlives_the_process_that_asked_for_it(specs, tmp_path):
         "run_isolated(json.load(open(sys.argv[1])), sys.argv[2])"
     )
     asker = psutil.Popen([sys.executable, "-c", code, str(request), str(tmp_path)])
-    worker = until(lambda: workers_of(asker), "the job to start")[0]
+    worker = wait_for(lambda: workers_of(asker))[0]
     asker.kill()
     asker.wait()
-    until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE, "the orphan to end")
+    wait_for(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE)
 
 
 def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, tmp_path):
@@ -99,10 +100,10 @@ def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, tmp_pa
     with dask_cluster(tmp_path) as (address, workers), ResultStore(tmp_path / "r.db") as store:
         thread, _ = in_thread(lambda: finished.extend(run_on_dask(specs, address, tmp_path, None)))
         victim = psutil.Process(workers["one"].pid)
-        job = until(lambda: workers_of(victim), "the worker to begin a job")[0]
-        until(lambda: workers_of(psutil.Process(workers["two"].pid)), "the other worker to begin a job")
+        job = wait_for(lambda: workers_of(victim))[0]
+        wait_for(lambda: workers_of(psutil.Process(workers["two"].pid)))
         os.kill(victim.pid, signal.SIGKILL)
-        until(lambda: not job.is_running() or job.status() == psutil.STATUS_ZOMBIE, "the killed worker's job to end")
+        wait_for(lambda: not job.is_running() or job.status() == psutil.STATUS_ZOMBIE)
         thread.join(PATIENCE_S)
         assert not thread.is_alive()
         added = [store.add(spec["key"], "label", spec, result) for spec, result in finished]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tiny import jobs_here
 
+from browser import is_readable_on_a_phone_and_on_paper
 from vislam.cli import run_verb
 from vislam.config import load
 from vislam.experiment.jobs import expand
@@ -77,3 +78,7 @@ def test_a_filter_without_vision_hears_nothing_of_the_camera_after_its_start(tmp
     np.testing.assert_array_equal(ways["seeing"].T_world_body, ways["blind"].T_world_body)
     live = [read_tum(tmp_path / name / "trajectory_live.tum").T_world_body for name in ways]
     assert len(live[0]) != len(live[1]) or not np.array_equal(*live)  # the graph does hear of it
+
+
+def test_the_report_is_readable_on_a_phone_and_on_paper(compared, chromium):
+    is_readable_on_a_phone_and_on_paper(chromium, compared / "report.html")

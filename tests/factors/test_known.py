@@ -1,7 +1,5 @@
 """One joint covariance for all loops of a keyframe: the gate answers as with exact marginals, the gains add up."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import gtsam

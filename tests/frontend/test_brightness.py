@@ -1,7 +1,5 @@
 """Steps of exposure: the tracks go on, and where nothing steps nothing changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

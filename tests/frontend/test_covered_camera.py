@@ -1,7 +1,5 @@
 """Stereo with one camera covered: the other goes on, says so, and the usual one is taken again when it sees."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

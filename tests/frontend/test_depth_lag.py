@@ -1,7 +1,5 @@
 """Depth that was taken at another moment than its image."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth images and stereo pairs as sources of inverse depth, and the keyframe policy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

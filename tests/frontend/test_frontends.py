@@ -1,7 +1,5 @@
 """The three front ends on drawn worlds with exact truth, and on every kind of bad frame."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from functools import cache
@@ -216,11 +214,11 @@ def test_a_gap_into_another_place_restarts() -> None:
 
 
 @pytest.mark.parametrize("kind", ["stereo", "rgbd"])
-def test_frames_without_depth_are_tracked_but_make_no_keyframe(kind: str) -> None:
+def test_frames_without_depth_are_tracked_but_make_no_keyframe(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     _, frames, poses = recording(kind)
-    config = replace(CONFIG, keyframe_min_alive_unfit=0.0)
+    monkeypatch.setattr("vislam.frontend.keyframes._KEYFRAME_MIN_ALIVE_UNFIT", 0.0)
     poor = [f if f.index % 7 == 0 else replace(f, images=f.images[:1], depth_m=None) for f in frames]
-    results = run(kind, poor, config)
+    results = run(kind, poor)
     assert all(r.vo.tracking is not Tracking.LOST for r in results)
     assert all(r.keyframe is None or r.keyframe.frame.index % 7 == 0 for r in results)
     for true, T, _ in motions(results, poor, poses):

@@ -1,7 +1,5 @@
 """Visual odometry alone on the first seconds of the real recordings, against their truth."""
 
-from __future__ import annotations
-
 from itertools import islice
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Front ends on points that were followed elsewhere: the same odometry, without a single image."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise

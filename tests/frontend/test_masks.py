@@ -12,7 +12,7 @@ from vislam.cli import run_verb
 from vislam.config import load
 from vislam.core import DataError, Frame, MaskedRecording, Observations
 from vislam.frontend.masks import Masks
-from vislam.mapping.depth.stereo import DenseStereo
+from vislam.mapping.depth.extract import DenseStereo
 from vislam.sim import open_world
 from vislam.trajectory import Trajectory, evaluate
 from vislam.vision.features import FlowSettings, are_used, describe, detect_corners, detect_harris, follow

@@ -1,7 +1,5 @@
 """The noise of tracks is measured while running: on points of known noise, and on drawn images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The planar front end on a drawn hall with exact truth, and everything in which it must not fail silently."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The fits of a motion over a floor: exact answers, derivatives, covariances, and what the points cannot tell."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

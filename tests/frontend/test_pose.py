@@ -1,7 +1,5 @@
 """The compiled kernels: Jacobians, pose refinement, two views, landmark updates, rolling shutter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

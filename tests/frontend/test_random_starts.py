@@ -1,7 +1,5 @@
 """One camera and an IMU among points, started at random: never a wrong scale or tilt without saying so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

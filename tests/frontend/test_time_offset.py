@@ -1,7 +1,5 @@
 """The camera's time offset from rotations: found from either side, its sigma honest, applied only when it counts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import takewhile
 
@@ -63,6 +61,14 @@ def test_without_turning_nothing_is_claimed() -> None:
     found = estimate(Start("uniform", 0, offset_s=0.02), config).estimate
     assert found.sigma_s > 0.8 * config.time_offset_sigma_s
     assert abs(found.offset_s) < config.time_offset_sigma_s
+
+
+def test_a_hole_longer_than_what_is_looked_at_begins_again() -> None:
+    start = Start("moving", 3, duration_s=5.0)
+    found = estimate(start, InitConfig())
+    last = start.frames[-1][0]
+    found.add(last.t_ns + 12 * NS, replace(last, t_ns=last.t_ns + 12 * NS))
+    assert found.wanted_ns() is None
 
 
 def test_switched_off_nothing_is_estimated() -> None:

@@ -1,7 +1,5 @@
 """Whether tracks agree on a motion, and when a filter's expectation is followed instead."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -118,3 +118,31 @@ def test_overconfident_odometry_with_aliased_groups_is_found_out() -> None:
     """Odometry claims a third of its sigmas, so that true loops are beyond the gate like the false ones."""
     outcome = Outcome(world_of("high"), 10, claimed=0.3)
     assert outcome.false_kept == 0 and outcome.true_share >= 0.95
+
+
+def test_a_loop_that_a_user_takes_out_stays_out_and_the_map_is_as_if_it_had_never_been() -> None:
+    """The first loops agree on something wrong, so that no review finds them; one is taken out, then the others."""
+    world, wrong = world_of("low"), range(103, 115, 3)
+    graphs = [PoseGraph(CONFIG, None, MACHINE, RIG, WindowConfig()) for _ in range(2)]
+    refused, places = [], {}
+    for k in range(world.count):
+        right = world.loop(k, k - 100, k) if k > 102 else None
+        packet, true = world.packet(k, imu=False), [right] if k > 130 and k % 3 == 0 else []
+        false = []
+        if k in wrong:
+            T = right.T_from_to.copy()
+            T[:3, 3] += np.array([0.10, -0.08, 0.06])
+            false = [replace(right, T_from_to=T)]
+        for graph, edges in zip(graphs, (true, true + false), strict=True):
+            if k == 0:
+                graph.initialise(None, world.truth[0])
+            undo = {118: (103, 9999), 124: tuple(wrong)}.get(k, ()) if graph is graphs[1] else ()
+            update = graph.add(packet, edges, undo=undo)
+        refused += [(k, n) for n in update.rejected_loop_ids if n in wrong]
+        places |= {state.id: state.place for state in graphs[1].take_record().loops}
+    assert refused == [(118, 103), (124, 106), (124, 109), (124, 112)]  # and no review brought one back
+    assert [places[n] for n in wrong] == ["undone"] * len(wrong)
+    clean, undone = (graph.finish().T_map_body for graph in graphs)
+    reports = {r.loop_id: r for r in graphs[1].edge_reports()}
+    assert all("undone by the user" in reports[n].reason and reports[n].weight == 0.0 for n in wrong)
+    assert np.abs(clean - undone).max() < 1e-5

@@ -25,8 +25,8 @@ from vislam.hw.emulator import (
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
-from worlds.fifo_boards import Stalled, fifo_board, gathered, inertial_chip
-from worlds.gy85 import FIELD_UT, driving, still
+from worlds.fifo_boards import Stalled, fifo_board, inertial_chip
+from worlds.gy85 import FIELD_UT, collect, driving, still
 
 BOARDS = (
     ("MPU-9250", "inside", "AK8963", 0x0C),
@@ -42,7 +42,7 @@ def test_the_field_comes_in_the_body_s_axes_at_its_rate(kind: str, magnetometer:
     config = BoardConfig(calibration=calibration)
     with fifo_board(kind, magnetometer=magnetometer, config=config) as (driver, _, clock):
         assert driver.magnetometer_name == name
-        inertial, magnetic = gathered(driver, clock, 5.0)
+        inertial, magnetic = collect(driver, clock, 5.0)
         assert len(magnetic) == pytest.approx(245, abs=10)
         assert (np.diff([m.t_ns for m in magnetic]) > 0).all()
         np.testing.assert_allclose(np.mean([m.field_ut for m in magnetic], axis=0), FIELD_UT, atol=2.0)
@@ -56,19 +56,19 @@ def test_it_goes_and_comes_back_without_the_inertial_chip_noticing(
     kind: str, magnetometer: str, name: str, address: int
 ) -> None:
     with fifo_board(kind, magnetometer=magnetometer) as (driver, virtual, clock):
-        gathered(driver, clock, 1.0)
+        collect(driver, clock, 1.0)
         virtual.chips[address].power_cycle()
-        gathered(driver, clock, 1.0)
+        collect(driver, clock, 1.0)
         assert driver.counters().get("settings_lost", 0) == 1
         chip = virtual.chips.pop(address)
-        inertial, magnetic = gathered(driver, clock, 2.0)
+        inertial, magnetic = collect(driver, clock, 2.0)
         assert len(inertial) == pytest.approx(2.0 * driver.rate_hz, rel=0.03)
         assert len(magnetic) < 3
         assert driver.health() & Health.MAG_FAULT
         virtual.chips[address] = chip
-        gathered(driver, clock, 1.0)
+        collect(driver, clock, 1.0)
         driver.health()
-        assert len(gathered(driver, clock, 1.0)[1]) == pytest.approx(50, abs=4)
+        assert len(collect(driver, clock, 1.0)[1]) == pytest.approx(50, abs=4)
         assert driver.health() == Health(0)
 
 
@@ -77,16 +77,16 @@ def test_one_that_hangs_and_one_beyond_its_range_are_told(
     kind: str, magnetometer: str, name: str, address: int
 ) -> None:
     with fifo_board(kind, magnetometer=magnetometer) as (driver, virtual, clock):
-        gathered(driver, clock, 1.0)
+        collect(driver, clock, 1.0)
         virtual.chips[address].is_frozen = True
-        gathered(driver, clock, 3.0)
+        collect(driver, clock, 3.0)
         assert driver.counters().get("mag_silent", 0) >= 1
 
     def magnet(t_ns: int):  # type: ignore[no-untyped-def]
         return (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), (4000.0, -3500.0, 100.0), 30.0
 
     with fifo_board(kind, magnetometer=magnetometer, truth=magnet) as (driver, _, clock):
-        inertial, magnetic = gathered(driver, clock, 2.0)
+        inertial, magnetic = collect(driver, clock, 2.0)
         assert magnetic == []
         assert len(inertial) > 350
         assert driver.counters()["mag_overflow"] > 30
@@ -121,14 +121,14 @@ def test_a_host_put_aside_anywhere_dates_no_field_wrongly(kind: Any) -> None:
 
 def test_unplugging_takes_and_brings_both() -> None:
     with fifo_board("ICM-20948", magnetometer="inside") as (driver, virtual, clock):
-        gathered(driver, clock, 1.0)
+        collect(driver, clock, 1.0)
         virtual.unplug()
-        gathered(driver, clock, 1.5)
+        collect(driver, clock, 1.5)
         assert driver.health() & Health.MAG_FAULT
         virtual.replug()
-        gathered(driver, clock, 1.5)
+        collect(driver, clock, 1.5)
         driver.health()
-        inertial, magnetic = gathered(driver, clock, 1.0)
+        inertial, magnetic = collect(driver, clock, 1.0)
         assert len(inertial) == pytest.approx(225, abs=5)
         assert len(magnetic) == pytest.approx(50, abs=4)
         assert driver.health() == Health(0)
@@ -136,10 +136,10 @@ def test_unplugging_takes_and_brings_both() -> None:
 
 def test_asked_for_or_not() -> None:
     with fifo_board("LSM6DSOX", config=BoardConfig(mag=True)) as (driver, _, clock):
-        gathered(driver, clock, 0.5)
+        collect(driver, clock, 0.5)
         assert driver.health() == Health.MAG_FAULT
     with fifo_board("LSM6DSOX", config=BoardConfig(mag=False), magnetometer="LIS3MDL") as (driver, _, clock):
-        assert gathered(driver, clock, 0.5)[1] == []
+        assert collect(driver, clock, 0.5)[1] == []
         assert driver.health() == Health(0)
 
 

@@ -2,18 +2,16 @@
 
 import json
 import os
-import threading
 import time
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
 from vislam.cli import run_verb
 from vislam.hw.doctor import HardwareReport, Wanted, examine
 from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualAdxl345, emulated_bus, emulated_gy85
+from worlds.capture import FakeCapture
 from worlds.gy85 import driving, still
 
 
@@ -146,41 +144,11 @@ def test_files_of_ports_and_cameras_are_listed_and_closed_ones_named(
     assert "you may not open it -> sudo usermod -aG" in text
 
 
-class Camera:
-    """OpenCV's capture of a camera at 100 Hz that stamps with CLOCK_MONOTONIC and has no focus."""
-
-    def __init__(self, path: str) -> None:
-        self.values: dict[int, float] = {}
-        self.stop = threading.Event()
-
-    def isOpened(self) -> bool:
-        return True
-
-    def set(self, prop: int, value: float) -> bool:
-        self.values[prop] = value
-        return True
-
-    def get(self, prop: int) -> float:
-        if prop == cv2.CAP_PROP_POS_MSEC:
-            return time.monotonic_ns() * 1e-6 - 5.0
-        return -1.0 if prop in (cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS) else self.values.get(prop, -1.0)
-
-    def grab(self) -> bool:
-        time.sleep(0.01)
-        return True
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        return True, np.zeros((480, 640, 3), np.uint8)
-
-    def release(self) -> None:
-        self.stop.set()
-
-
 def test_a_camera_that_is_asked_for_is_measured_and_its_settings_compared(tmp_path: Path) -> None:
     device = tmp_path / "dev" / "video0"
     device.parent.mkdir()
     device.touch()
-    report = examine(Wanted(camera=str(device)), 0.5, None, tmp_path, open_capture=Camera)
+    report = examine(Wanted(camera=str(device)), 0.5, None, tmp_path, open_capture=lambda _: FakeCapture())
     assert report.timings[0].count > 0
     assert "focus: asked 0.0, the camera does not offer it" in said(report, "warning")
     missing = examine(Wanted(camera=str(tmp_path / "dev" / "video9")), 0.5, None, tmp_path)

@@ -24,6 +24,7 @@ from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertia
 from vislam.live.sources import open_live
 from vislam.runs.record import record
 from vislam.runs.sources import recorded_path
+from waiting import until_it_holds
 from worlds.fifo_boards import FIRMWARE
 from worlds.gy85 import driving, still
 
@@ -220,7 +221,9 @@ def test_a_board_is_recorded(tmp_path: Path) -> None:
     from vislam.config import RecordConfig
 
     with emulated_bus(emulated_board("ICM-20948", still, time.monotonic_ns)) as bus:
-        recorded = record(tmp_path / "r", f"board:{bus.path}", "none", SensorsConfig(), RecordConfig(), seconds=1.0)
+        recorded = record(
+            tmp_path / "r", f"board:{bus.path}", "none", SensorsConfig(), RecordConfig(), **until_it_holds(imu=60)
+        )
     assert sum(recorded.counts.values()) > 50
     assert any("stamped by the chip's clock" in note for note in recorded.notes)
     rows = np.loadtxt(tmp_path / "r/mav0/imu0/data.csv", delimiter=",", comments="#")

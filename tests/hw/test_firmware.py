@@ -25,7 +25,7 @@ from vislam.hw.bridge.protocol import (
     Status,
     encode,
 )
-from vislam.hw.emulator.bridged import bridged
+from vislam.hw.emulator.bridge import bridged
 
 SKETCH = Path(str(files("vislam.hw"))) / "firmware" / "vislam_bridge"
 FAKE = Path(__file__).parent / "fake_arduino"

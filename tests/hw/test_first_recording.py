@@ -1,12 +1,12 @@
 """docs/first-recording.md, tried as it stands: its commands in their order, on simulated and emulated devices."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
+import signal
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,6 +22,7 @@ from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from worlds import gopro
 from worlds.bag_writer import from_asl, types_of, write_bag
 from worlds.board import BOARD, pose, see
+from worlds.capture import FakeCapture
 
 PAGE = Path(__file__).parents[2] / "docs" / "first-recording.md"
 # what stands on the page and is not run here, and why
@@ -236,43 +237,26 @@ def test_a_gopro(machine: Machine, drive: Path) -> None:
     machine.check(title)
 
 
-class Capture:
-    """A webcam of 640x480 at 30 Hz before a wall."""
+def wall(_path: str, last: int = 0) -> FakeCapture:
+    """Return a webcam of 640x480 at 30 Hz before a wall; somebody presses Ctrl-C at its `last` frame."""
+    rng = np.random.default_rng(0)
+    small = rng.integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    seen = cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC)
+    noise = [rng.integers(0, 3, seen.shape, dtype=np.uint8) for _ in range(4)]
+    pressed: list[int] = []
 
-    def __init__(self, _path: str) -> None:
-        rng = np.random.default_rng(0)
-        small = rng.integers(0, 255, (60, 80, 3), dtype=np.uint8)
-        self._wall = cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC)
-        self._noise = [rng.integers(0, 3, self._wall.shape, dtype=np.uint8) for _ in range(4)]
-        self._values = dict[int, float]()
-        self._count, self._stamp_ms = 0, 0.0
+    def view(count: int) -> np.ndarray:
+        if count >= last > 0 and not pressed:
+            pressed.append(count)
+            signal.raise_signal(signal.SIGINT)
+        return cv2.add(seen, noise[count % 4])
 
-    def isOpened(self) -> bool:
-        return True
-
-    def set(self, prop: int, value: float) -> bool:
-        self._values[prop] = value
-        return True
-
-    def get(self, prop: int) -> float:
-        return self._stamp_ms if prop == cv2.CAP_PROP_POS_MSEC else self._values.get(prop, -1.0)
-
-    def grab(self) -> bool:
-        time.sleep(1.0 / 30.0)
-        self._count += 1
-        self._stamp_ms = time.monotonic_ns() / 1e6 - 2.0
-        return True
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        return True, cv2.add(self._wall, self._noise[self._count % 4])
-
-    def release(self) -> None:
-        return None
+    return FakeCapture(rate_hz=30.0, view=view)
 
 
 @pytest.fixture
 def camera_0(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(webcam, "_open_v4l2", Capture)
+    monkeypatch.setattr(webcam, "_open_v4l2", wall)
     monkeypatch.setattr(webcam, "why_not_there", lambda _path: None)
 
 
@@ -285,15 +269,16 @@ def board() -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("camera_0", "board")
-def test_a_webcam_and_an_mpu6050(machine: Machine) -> None:
+def test_a_webcam_and_an_mpu6050(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     title = "A webcam and an MPU-6050"
-    short = {"record": ("--seconds", "2", "--min-free-gb", "0"), "doctor": ("--seconds", "1")}
+    short = {"record": ("--min-free-gb", "0"), "doctor": ("--seconds", "1")}
     port = machine.folder / "tty"
     with BridgeEmulator(port, at_rest, seed=1, board="MPU-6050"):
         for command in commands(section(title)):
             if command in LEFT_OUT:
                 continue
             told = ("/dev/ttyUSB0", str(port))
+            monkeypatch.setattr(webcam, "_open_v4l2", partial(wall, last=120 if "record" in command else 0))
             machine.run(command, *short.get(command.split()[1], ()), instead=told)
     machine.heard = machine.heard.replace(str(port), "/dev/ttyUSB0")
     machine.check(title)

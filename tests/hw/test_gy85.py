@@ -9,11 +9,10 @@ from vislam.config import Gy85Config, PowerUpConfig, SensorCalibration
 from vislam.core.errors import HardwareError, UsageError
 from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import ImuSample, ImuSpan
-from vislam.hw.gy85 import Gy85
+from vislam.hw.gy85 import Gy85, SampleTrack
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.hw.timing import SampleClock
-from vislam.hw.track import SampleTrack
 from vislam.imu import NoiseFloor, PowerUp, Refusal, power_up
 from worlds.gy85 import FIELD_UT, board, collect, driving, errors, still
 

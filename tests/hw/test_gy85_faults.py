@@ -194,26 +194,6 @@ def test_a_magnetometer_beyond_its_range_gives_no_sample() -> None:
         assert driver.counters()["mag_overflow"] > 30
 
 
-def test_temperature_drift_is_told_and_its_known_part_taken_off() -> None:
-    def warming(t_ns: int):  # type: ignore[no-untyped-def]
-        rate, force, field, _ = still(t_ns)
-        return rate, force, field, 25.0 + (t_ns - 1_000_000_000_000) * 1e-9
-
-    with board(truth=warming) as (driver, virtual, clock):
-        per_c = np.array(virtual.chips[0x68].error.bias_per_c)
-        first, _ = collect(driver, clock, 2.0)
-        assert driver.temperature_c == pytest.approx(26.0, abs=1.1)
-        driver.zeroed_at(driver.temperature_c, per_c)
-        collect(driver, clock, 6.0)
-        assert not driver.health() & Health.TEMPERATURE_DRIFT
-        collect(driver, clock, 10.0)
-        last, _ = collect(driver, clock, 2.0)
-        assert driver.health() & Health.TEMPERATURE_DRIFT
-        drift = np.mean([s.gyro_rad_s for s in last], axis=0) - np.mean([s.gyro_rad_s for s in first], axis=0)
-        assert abs(18.0 * per_c).max() > 0.005, "the chip itself drifts"
-        assert abs(drift).max() < 0.0025
-
-
 def test_a_failed_self_test_stays_in_the_health_word() -> None:
     with board() as (driver, virtual, clock):
         weak = VirtualAdxl345(still, clock.now_ns, self_test_g=(0.0, 0.0, 0.0))

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
@@ -23,6 +23,7 @@ from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_
 from vislam.hw.sensors import check_devices
 from vislam.live.sources import open_live
 from vislam.runs.record import record
+from waiting import Looks, until_it_holds, wait_for
 
 LONG_S = 600.0
 CAMERA = OakConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0, position_m=(0.1, 0.0, 0.2))
@@ -35,13 +36,6 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     monkeypatch.setitem(sys.modules, "depthai", world.module())
     yield world
     assert all(device.closed for device in world.opened)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def test_the_rig_is_that_of_the_factory(world: World) -> None:
@@ -136,12 +130,12 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
 def test_it_is_recorded_and_examined(world: World, tmp_path: Path) -> None:
     world.period_ns = 30_000_000
     settings = replace(SENSORS, oak=replace(CAMERA, rate_hz=33.0))
-    record(tmp_path / "r", "none", "oak:1844", settings, RecordConfig(min_free_gb=0.0), seconds=0.5)
+    record(tmp_path / "r", "none", "oak:1844", settings, RecordConfig(min_free_gb=0.0), **until_it_holds(frames=9))
     assert world.opened[-1].info == "1844"
     recording = open_dataset(str(tmp_path / "r"))
     assert recording.rig.is_stereo
     assert any(isinstance(event, Frame) and len(event.images) == 2 for event in recording.events())
-    said = [finding.what for finding in examine(Wanted(camera="oak"), 0.3).findings if finding.where == "oak"]
+    said = [finding.what for finding in examine(Wanted(camera="oak"), 0.3, Looks()).findings if finding.where == "oak"]
     assert any("by depthai's match of its clock" in what for what in said)
     assert any("has not met a real camera" in what for what in said)
 
@@ -258,12 +252,12 @@ def test_a_device_with_its_imu_comes_back(world: World) -> None:
 @pytest.mark.parametrize("name", ["oak", "oak,depth"])
 def test_a_recording_holds_images_and_its_imu(world: World, tmp_path: Path, name: str) -> None:
     world.period_ns = 30_000_000
-    record(tmp_path / "r", "oak", name, SLOW, RecordConfig(min_free_gb=0.0), seconds=1.0)
+    record(tmp_path / "r", "oak", name, SLOW, RecordConfig(min_free_gb=0.0), **until_it_holds(frames=9, imu=40))
     recording = open_dataset(str(tmp_path / "r"))
     events = list(recording.events())
     frame = next(event for event in events if isinstance(event, Frame))
     assert (frame.depth_m is not None, recording.rig.has_depth) == ("depth" in name, "depth" in name)
     assert sum(isinstance(event, ImuSample) for event in events) > 20
-    report = examine(Wanted(imu="oak", camera=name), 0.4)
+    report = examine(Wanted(imu="oak", camera=name), 0.4, Looks())
     assert {timing.name for timing in report.timings} == {"oak: inertial", f"{name}: images"}
     assert any("which its images have too" in finding.what for finding in report.findings)

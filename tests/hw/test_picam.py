@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
@@ -14,12 +14,13 @@ import pytest
 from tests.hw.fake_picamera2 import World
 from vislam.config import PicamConfig, RecordConfig, SensorsConfig
 from vislam.core.errors import HardwareError
-from vislam.hw.cameras.picam import PicamStream, open_picam
+from vislam.hw.cameras.picam import PicamStream
 from vislam.hw.doctor import Wanted, examine
 from vislam.hw.health import Health
-from vislam.hw.library_cameras import is_library_camera
+from vislam.hw.library_cameras import is_library_camera, open_image_camera
 from vislam.hw.sensors import check_devices, is_video, open_camera
 from vislam.runs.record import record
+from waiting import Looks, until_it_holds, wait_for
 
 LONG_S = 600.0
 CONFIG = PicamConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0)
@@ -32,13 +33,6 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     yield world
     assert world.unreleased == 0
     assert all(camera.closed for camera in world.opened)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def test_images_are_stamped_in_the_middle_of_the_exposure(world: World) -> None:
@@ -87,7 +81,7 @@ def test_a_stamp_of_no_known_clock_counts_and_the_last_age_is_used(world: World)
 
 
 def test_exposure_gain_and_focus_are_fixed_before_the_first_image(world: World) -> None:
-    with closing(open_picam(replace(CONFIG, gain=2.5))) as camera:
+    with closing(open_image_camera("picam", SensorsConfig(picam=replace(CONFIG, gain=2.5)))) as camera:
         shots = [shot for _ in range(5) if (shot := camera.read(LONG_S)) is not None]
         asked = world.opened[0].config
         assert asked["controls"] == {
@@ -102,10 +96,10 @@ def test_exposure_gain_and_focus_are_fixed_before_the_first_image(world: World) 
 
 def test_what_the_camera_lacks_is_told(world: World) -> None:
     world.has_autofocus, world.largest = False, (320, 240)
-    with closing(open_picam(CONFIG)) as camera:
+    with closing(open_image_camera("picam", SensorsConfig(picam=CONFIG))) as camera:
         differing = {setting.name: setting.got for setting in camera.settings if setting.differs}
         assert differing == {"width [px]": 320.0, "height [px]": 240.0, "AfMode": None, "LensPosition": None}
-        report = examine(Wanted(camera="picam"), 0.3)
+        report = examine(Wanted(camera="picam"), 0.3, Looks())
     said = "\n".join(f.what for f in report.findings)
     assert "LensPosition: asked 0.0, the camera does not offer it" in said
     assert "stamped by the sensor's first line" in said
@@ -114,8 +108,15 @@ def test_what_the_camera_lacks_is_told(world: World) -> None:
     assert timing.jitter_ms is not None
 
 
+def test_a_first_image_that_is_late_is_waited_for(world: World) -> None:
+    world.late = 3
+    with closing(open_image_camera("picam", SensorsConfig(picam=CONFIG))) as camera:
+        assert camera.read(LONG_S) is not None
+        assert camera.counters()["lost"] == 3
+
+
 def test_a_cable_that_comes_loose_is_reported_and_the_camera_opened_again(world: World) -> None:
-    with closing(open_picam(replace(CONFIG, missing_s=0.05))) as camera:
+    with closing(open_image_camera("picam", SensorsConfig(picam=replace(CONFIG, missing_s=0.05)))) as camera:
         wait_for(lambda: camera.counters().get("captured", 0) > 3)
         world.unplugged = True
         wait_for(lambda: camera.health() == Health.CAMERA_MISSING)
@@ -147,7 +148,9 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
 
 def test_it_can_be_recorded(world: World, tmp_path: Path) -> None:
     config = replace(SensorsConfig(), picam=CONFIG)
-    recorded = record(tmp_path / "r", "none", "picam", config, RecordConfig(min_free_gb=0.0), seconds=0.5)
+    recorded = record(
+        tmp_path / "r", "none", "picam", config, RecordConfig(min_free_gb=0.0), **until_it_holds(frames=9)
+    )
     assert recorded.counts["frames"] > 0
     facts = json.loads((tmp_path / "r" / "recording.json").read_text())
     assert facts["stamped_by"] == "the sensor's first line, less half the exposure"

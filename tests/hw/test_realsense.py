@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
@@ -25,10 +25,12 @@ from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_
 from vislam.hw.sensors import check_devices, is_video, open_inertial
 from vislam.live.sources import open_live
 from vislam.runs.record import record
+from waiting import Looks, until_it_holds, wait_for
 
 LONG_S = 600.0
 CAMERA = RealsenseConfig(rate_hz=30.0, reopen_s=0.01, missing_s=30.0, start_s=30.0, position_m=(0.1, 0.0, 0.2))
 SENSORS = replace(SensorsConfig(), realsense=CAMERA)
+UNPLACED = replace(SensorsConfig(), realsense=replace(CAMERA, position_m=None))
 
 
 @pytest.fixture
@@ -37,13 +39,6 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     monkeypatch.setitem(sys.modules, "pyrealsense2", world.module())
     yield world
     assert world.running == 0
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def first(camera: Any) -> Frame:
@@ -191,7 +186,7 @@ def test_live_needs_to_know_where_it_sits(world: World, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["realsense", "realsense,depth"])
 def test_a_recording_holds_all_of_it(world: World, tmp_path: Path, name: str) -> None:
     world.period_s = 0.03
-    recorded = record(tmp_path / "r", "none", name, SensorsConfig(), RecordConfig(min_free_gb=0.0), seconds=1.0)
+    recorded = record(tmp_path / "r", "none", name, UNPLACED, RecordConfig(min_free_gb=0.0), **until_it_holds(frames=9))
     assert any("position_m is not set" in note for note in recorded.notes)
     facts = json.loads((tmp_path / "r" / "recording.json").read_text())
     assert facts["stamped_by"] == "the device's clock, in the middle of the exposure"
@@ -203,7 +198,7 @@ def test_a_recording_holds_all_of_it(world: World, tmp_path: Path, name: str) ->
 
 
 def test_doctor_says_where_stamps_come_from_and_their_jitter(world: World) -> None:
-    report = examine(Wanted(camera="realsense"), 0.3)
+    report = examine(Wanted(camera="realsense"), 0.3, Looks())
     said = [finding.what for finding in report.findings if finding.where == "realsense"]
     assert "stamped by the device's clock, in the middle of the exposure" in said
     assert any("has not met a real camera" in what for what in said)
@@ -334,7 +329,9 @@ def test_a_device_with_its_imu_comes_back(world: World) -> None:
 @pytest.mark.parametrize("name", ["realsense", "realsense,depth"])
 def test_a_recording_holds_images_and_its_imu(world: World, tmp_path: Path, name: str) -> None:
     world.period_s = 0.03
-    recorded = record(tmp_path / "r", "realsense", name, SensorsConfig(), RecordConfig(min_free_gb=0.0), seconds=2.0)
+    recorded = record(
+        tmp_path / "r", "realsense", name, UNPLACED, RecordConfig(min_free_gb=0.0), **until_it_holds(frames=9, imu=40)
+    )
     assert any("stamped by the device's clock" in note for note in recorded.notes)
     assert not any("position_m" in note for note in recorded.notes)
     recording = open_dataset(str(tmp_path / "r"))
@@ -348,7 +345,7 @@ def test_a_recording_holds_images_and_its_imu(world: World, tmp_path: Path, name
 
 
 def test_doctor_measures_both(world: World) -> None:
-    report = examine(Wanted(imu="realsense", camera="realsense,depth"), 0.5)
+    report = examine(Wanted(imu="realsense", camera="realsense,depth"), 0.5, Looks(), sensors=SENSORS)
     said = [finding.what for finding in report.findings]
     assert "stamped by the device's clock, on a line under the arrivals of the gyro" in said
     assert any(what.endswith("on one line with its IMU's") for what in said)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from vislam.config import RealsenseConfig, SensorsConfig
-from vislam.hw.cameras import realsense, realsense_imu
+from vislam.hw.cameras import realsense
 from vislam.hw.library_cameras import open_with_imu
 
 rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
@@ -81,8 +81,7 @@ def test_the_driver_reads_both_by_the_librarys_callbacks(tmp_path: Path, monkeyp
         return config
 
     monkeypatch.setattr(rs, "config", played)
-    for module in (realsense, realsense_imu):
-        monkeypatch.setattr(module, "imu_pose", lambda rs, profile, first: np.eye(4))
+    monkeypatch.setattr(realsense, "imu_pose", lambda rs, profile, first: np.eye(4))
     camera, imu = open_with_imu("realsense", replace(SensorsConfig(), realsense=CAMERA))
     frames, samples, end = [], [], time.monotonic() + LONG_S
     with closing(camera):

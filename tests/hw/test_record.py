@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from vislam.datasets.recorder import Recorder
 from vislam.hw.emulator import emulated_bus, emulated_gy85
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.runs.record import Recorded, record
+from waiting import wait_for
 
 LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 WIDTH, HEIGHT = 320, 240
@@ -65,13 +66,6 @@ def events_of(folder: Path) -> tuple[list[ImuSample], list[MagSample], list[Fram
     kinds = (ImuSample, MagSample, Frame)
     imu, mag, frames = ([event for event in events if isinstance(event, kind)] for kind in kinds)
     return imu, mag, frames
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def recorded_until(rows: dict[str, int], out: Path, *arguments: object) -> None:

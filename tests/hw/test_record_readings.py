@@ -23,7 +23,6 @@ from vislam.core.errors import HardwareError, UsageError
 from vislam.core.readings import Reading
 from vislam.datasets.sensor_files import sensor_readings
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
-from vislam.live.port_readings import PortReadings
 from vislam.runs.record import Recorded, record
 from vislam.runs.recorded_readings import further_ports
 from vislam.sensors.toml import load_sensor_setup
@@ -132,7 +131,7 @@ def recorded_until_all_spoke(around: Surroundings, out: Path, sensors: SensorsCo
 
     thread = threading.Thread(target=look)
     thread.start()
-    further = further_ports(around.cart, PortReadings)
+    further = further_ports(around.cart)
     recorded = record(out, f"serial:{around.tty}", "none", sensors, CONFIG, stop=stop, further=further)
     thread.join()
     return recorded
@@ -205,18 +204,16 @@ def test_a_run_on_the_recording_has_the_same_readings(
 def test_sensors_that_cannot_be_recorded_are_refused(
     around: Surroundings, sensors: SensorsConfig, tmp_path: Path
 ) -> None:
-    further = further_ports(around.cart, PortReadings)
+    further = further_ports(around.cart)
     with pytest.raises(UsageError, match=r"port = \"bridge\" is the serial bridge, and --imu gy85 is none"):
         record(tmp_path / "a", "gy85", "none", sensors, CONFIG, further=further)
     gone = tmp_path / "gone.toml"
     gone.write_text('[sensors.baro]\nkind = "height"\nport = "/dev/ttyNOWHERE"\n')
     with pytest.raises(HardwareError, match="there is no port /dev/ttyNOWHERE"):
-        record(
-            tmp_path / "b", f"serial:{around.tty}", "none", sensors, CONFIG, further=further_ports(gone, PortReadings)
-        )
+        record(tmp_path / "b", f"serial:{around.tty}", "none", sensors, CONFIG, further=further_ports(gone))
     gone.write_text('[sensors.baro]\nkind = "height"\nfile = "baro.csv"\n')
     with pytest.raises(UsageError, match=r"\[sensors.baro\]: it needs a port to be recorded from"):
-        further_ports(gone, PortReadings)
+        further_ports(gone)
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "b").exists()
 
@@ -227,7 +224,7 @@ def test_a_sensor_that_says_nothing_is_named_at_the_end(sensors: SensorsConfig, 
     with BridgeEmulator(tmp_path / "tty", at_rest):  # a sketch that counts nothing
         recorded = record(
             tmp_path / "r", f"serial:{tmp_path / 'tty'}", "none", replace(sensors), CONFIG, seconds=2.0,
-            further=further_ports(cart, PortReadings),
+            further=further_ports(cart),
         )  # fmt: skip
     assert any(
         "[sensors.wheels] gave no reading: the sketch on the board counts no encoders" in n for n in recorded.notes

@@ -18,54 +18,10 @@ from vislam.hw.cameras.video import VideoCamera
 from vislam.hw.cameras.webcam import Webcam, _Stamper
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
+from waiting import wait_for
+from worlds.capture import AGE_NS, FakeCapture
 
 LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
-AGE_NS = 20_000_000
-
-
-class FakeCapture:
-    """A camera at 200 Hz with limited abilities; faults are set on the class's instance from the test."""
-
-    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        self.values: dict[int, float] = {cv2.CAP_PROP_FRAME_WIDTH: 640.0, cv2.CAP_PROP_FRAME_HEIGHT: 480.0}
-        self.clock = clock
-        self.unplugged = self.closed = self.damaged = False
-        self.hang = threading.Event()
-        self.hang.set()
-        self.grabbed = 0
-        self.stamp_ms = 0.0
-        self.size: tuple[int, int] | None = None
-        self.unsupported = {cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_AUTOFOCUS}
-
-    def isOpened(self) -> bool:
-        return not self.unplugged
-
-    def set(self, prop: int, value: float) -> bool:
-        if prop in self.unsupported:
-            return False
-        if prop == cv2.CAP_PROP_FRAME_WIDTH:
-            value = min(value, 800)
-        self.values[prop] = round(value)
-        return True
-
-    def get(self, prop: int) -> float:
-        if prop == cv2.CAP_PROP_POS_MSEC:
-            return self.stamp_ms
-        return self.values.get(prop, -1.0)
-
-    def grab(self) -> bool:
-        self.hang.wait(60.0)  # what a test leaves hanging ends some time
-        time.sleep(0.005)
-        self.grabbed += 1
-        self.stamp_ms = (self.clock() - AGE_NS) / 1e6
-        return not self.unplugged
-
-    def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        width, height = self.size or (int(self.get(cv2.CAP_PROP_FRAME_WIDTH)), int(self.get(cv2.CAP_PROP_FRAME_HEIGHT)))
-        return not self.damaged, None if self.damaged else np.full((height, width, 3), self.grabbed % 251, np.uint8)
-
-    def release(self) -> None:
-        self.closed = True
 
 
 @pytest.fixture
@@ -73,13 +29,6 @@ def config(tmp_path: Path) -> WebcamConfig:
     device = tmp_path / "video0"
     device.touch()
     return WebcamConfig(device=str(device), missing_s=0.2, reopen_s=0.02, start_s=LONG_S)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def test_settings_are_set_and_read_back(config: WebcamConfig) -> None:

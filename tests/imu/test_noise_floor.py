@@ -1,7 +1,5 @@
 """The white noise that the samples show against the noise that the model claims."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

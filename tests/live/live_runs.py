@@ -4,8 +4,6 @@ The recording is played again from its start each time, as a cart does that was 
 ended when it has been found, or has seen enough, however long that takes.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable

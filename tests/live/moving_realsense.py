@@ -4,8 +4,6 @@ What is done to it stands in files of a folder, for it lives in another process:
 [ns] when it begins to move, `unplugged` is there while it is unplugged; it leaves `stopped` when it was given back.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Encoders and a receiver at the serial bridge: real pyserial and driver over a pseudo-terminal, up to the readings."""
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +14,7 @@ import pytest
 from vislam.config import BridgeClockConfig, Config, SensorsConfig, SerialConfig
 from vislam.core.errors import UsageError
 from vislam.core.readings import Reading
-from vislam.hw import talks
+from vislam.hw import PortReadings, talks
 from vislam.hw.bridge import protocol
 from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.bridge.clock import DeviceClock
@@ -24,7 +22,6 @@ from vislam.hw.bridge.passer import BridgeState, Passer, passed_on
 from vislam.hw.bridge.protocol import Chips, Counts, FrameDecoder, Hello, Passed, encode
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.hw.health import Health
-from vislam.live.port_readings import PortReadings
 from vislam.live.sources import open_live
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.ticks import TicksSettings

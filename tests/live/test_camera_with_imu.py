@@ -1,7 +1,5 @@
 """A live run on a camera with the IMU inside it: a stand-in for the library that moves, is unplugged and comes back."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

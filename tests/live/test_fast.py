@@ -1,7 +1,5 @@
 """The fast path: a twin of vision's filter that publishes at the rate of samples and says what its poses are worth."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A satellite receiver on a port: real pyserial over a pseudo-terminal that is unplugged and plugged in again."""
 
-from __future__ import annotations
-
 import os
 import pty
 import struct
@@ -18,12 +16,12 @@ import pytest
 
 from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
-from vislam.hw import reading_port, talks
-from vislam.hw.gnss_stream import NmeaStream, UbxStream
+from vislam.hw import PortReadings, reading_port, talks
 from vislam.hw.reading_port import ReadingPort, check_port
-from vislam.live.port_readings import PortReadings
+from vislam.hw.talks import NmeaStream, UbxStream
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.toml import SensorPort
+from waiting import wait_for
 
 LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 METRES_PER_MINUTE = 1852.2  # of latitude, at 48 degrees, to a metre
@@ -76,13 +74,6 @@ class Receiver:
         os.close(self.master)
 
 
-def until(true: Callable[[], bool], what: Callable[[], object]) -> None:
-    end = time.monotonic() + LONG_S
-    while not true():
-        assert time.monotonic() < end, what()
-        time.sleep(0.005)
-
-
 @pytest.fixture
 def config(tmp_path: Path) -> SensorPort:
     return SensorPort(str(tmp_path / "tty"), 9600, "nmea", 0.25, GnssSettings())
@@ -108,22 +99,22 @@ def test_a_receiver_that_is_unplugged_goes_on_in_the_frame_it_had(
         return sensors.status(), sensors.counters()
 
     try:
-        until(lambda: sensors.counters()["gnss"]["opened"] == 1, state)
+        wait_for(lambda: sensors.counters()["gnss"]["opened"] == 1, state)
         assert sensors.datums() == {}
         said_ns = time.monotonic_ns()
         receiver.say(burst(0))
-        until(comes(1), state)
+        wait_for(comes(1), state)
         assert sensors.status() == {"gnss": "well"}
         datum = sensors.datums()["gnss"]
         assert found[0].sensor == "gnss"
         assert said_ns <= found[0].t_ns + 250_000_000 <= time.monotonic_ns()
         receiver.unplug()
-        until(lambda: "no port" in sensors.status()["gnss"], state)
+        wait_for(lambda: "no port" in sensors.status()["gnss"], state)
         assert sensors.counters()["gnss"]["port_lost"] == 1
         receiver.plug_in()
-        until(lambda: sensors.counters()["gnss"]["opened"] == 2, state)
+        wait_for(lambda: sensors.counters()["gnss"]["opened"] == 2, state)
         receiver.say(b"\xff\xffnoise\r\n" + burst(30, minutes=7.138))
-        until(comes(2), state)
+        wait_for(comes(2), state)
         assert sensors.status() == {"gnss": "well"}
     finally:
         sensors.close()
@@ -142,9 +133,9 @@ def test_a_fix_that_is_not_good_enough_is_told(config: SensorPort) -> None:
     settings = SensorPort(config.port, config.baud, "nmea", 0.0, GnssSettings(least_fix="rtk"))
     port = ReadingPort("gnss", settings)
     try:
-        until(lambda: port.counters()["opened"] == 1, port.status)
+        wait_for(lambda: port.counters()["opened"] == 1, port.status)
         receiver.say(burst(0))
-        until(lambda: "rtk is asked" in port.status(), port.status)
+        wait_for(lambda: "rtk is asked" in port.status(), port.status)
         assert port.take() == []
     finally:
         port.close()
@@ -156,7 +147,7 @@ def test_a_mute_port_is_told_and_opened_anew(config: SensorPort, monkeypatch: py
     receiver = Receiver(Path(config.port))
     port = ReadingPort("gnss", config)
     try:
-        until(lambda: port.counters()["opened"] > 1, port.status)
+        wait_for(lambda: port.counters()["opened"] > 1, port.status)
         assert "is silent" in port.status()
     finally:
         port.close()

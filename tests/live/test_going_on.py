@@ -1,7 +1,5 @@
 """Live runs that go on: resumed after Ctrl-C, a kill or an unplugged sensor, and in the map of another run."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -140,3 +138,21 @@ def test_the_command_line_goes_on_and_says_what_it_cannot(interrupted, tmp_path:
     assert f"vislam live --resume {out}" in capsys.readouterr().err
     assert (out / "session.db").is_file()
     assert not (tmp_path / "new").exists()
+
+
+def test_the_advice_after_an_interrupt_works_whether_or_not_something_was_recorded(
+    interrupted, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LiveRun, "execute", stopped)
+    monkeypatch.setattr(LiveRun, "is_brief", True)
+    new = ["live", "--source", f"replay:{WORLD}", "--out", str(tmp_path / "new"), "--view.no-enabled"]
+    for _ in range(2):
+        assert run_verb(new) == 130
+        assert "nothing was recorded yet; the same command begins again" in capsys.readouterr().err
+    out = shutil.copytree(interrupted[0], tmp_path / "run")
+    assert run_verb(["live", "--resume", str(out)]) == 130
+    assert f"vislam live --resume {out}, or vislam optimize {out}" in capsys.readouterr().err
+    assert run_verb(["optimize", str(out)]) == 0

@@ -1,7 +1,5 @@
 """Devices that say lines of numbers on a serial port: counts of encoders, and readings of any kind."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import time
@@ -15,9 +13,8 @@ from hypothesis import strategies as st
 
 from tests.live.test_gnss_port import Receiver
 from vislam.core.readings import Reading
-from vislam.hw import reading_port, talks
+from vislam.hw import PortReadings, reading_port, talks
 from vislam.hw.talks import LineTalk
-from vislam.live.port_readings import PortReadings
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.ticks import TicksSettings
 from vislam.sensors.toml import SensorPort, load_sensor_setup

@@ -1,7 +1,5 @@
 """The page of a live run in a real browser: it begins a run, shows it, saves its map and ends it; nothing is cut."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -82,6 +80,20 @@ def looks_right(page, width: int) -> None:
     assert page.evaluate(SMALLEST) >= 11.0
 
 
+def undo_a_loop(page) -> None:
+    """Click a loop that is in the graph, and take it out; the graph's own word for that comes back."""
+    rows = "window.vislamLive.view.data.loops.rows"
+    page.wait_for_function(f"() => {rows}.some((row) => row.decision === 'accepted')")
+    loop_id = page.evaluate(
+        f"() => {{ const k = {rows}.findIndex((row) => row.decision === 'accepted');"
+        f" window.vislamLive.view.onLoop(k); return {rows}[k].id; }}"
+    )
+    page.get_by_role("button", name="Undo").click()
+    page.get_by_role("button", name="Really undo?").click()
+    page.wait_for_function(f"(id) => {rows}.some((row) => row.id === id && row.decision === 'undone')", arg=loop_id)
+    assert "Loops undone" in page.locator("#facts").inner_text()
+
+
 def test_a_run_is_begun_seen_saved_and_ended_in_a_browser(chromium, waiting) -> None:
     page, faults = opened(chromium, waiting.url)
     phone, phone_faults = opened(chromium, waiting.url, 400, "dark")
@@ -94,15 +106,19 @@ def test_a_run_is_begun_seen_saved_and_ended_in_a_browser(chromium, waiting) -> 
     place = "() => Array.from(window.vislamLive.view.marker.matrix.elements)"
     before = page.evaluate(place)
     page.wait_for_function(f"(before) => ({place})().join() !== before.join()", arg=before)
+    page.get_by_text("Details", exact=True).click()
     facts = page.locator("#facts").inner_text()
     assert "x, y, z [m]" in facts
     assert "Keyframes" in facts
     assert page.locator("#processes li").count() == 4
+    first = page.locator("main > *").first
+    assert first.get_attribute("id") == "verdict" and "±" in first.inner_text()
     phone.wait_for_function("() => Number(document.documentElement.dataset.points) > 100")
     looks_right(page, 1400)
     looks_right(phone, 400)
+    undo_a_loop(page)
     page.get_by_role("button", name="Save map").click()
-    page.wait_for_selector("#notices li.saved")
+    page.get_by_text("saved/trajectory.tum").first.wait_for()
     assert (waiting.out / "saved" / "trajectory.tum").stat().st_size > 0
     page.get_by_role("button", name="Stop").click()
     page.get_by_role("button", name="Really stop?").click()

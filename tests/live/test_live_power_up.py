@@ -1,7 +1,5 @@
 """Power-up as `vislam live` does it: the real driver on emulated chips, refused while it moves, biases remembered."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Live without a camera: the same filter, graph and run folder by further sensors, however these are late."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Callable

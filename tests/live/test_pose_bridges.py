@@ -1,7 +1,5 @@
 """The pose on the wires of others: ROS 2 over DDS, MAVLink; checked against numbers worked out by hand."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os
@@ -114,8 +112,8 @@ def test_tf_says_nothing_of_map_while_the_place_in_it_is_not_known() -> None:
     assert [(link.header.frame_id, link.child_frame_id) for link in links] == [("odom", "base_link")]
 
 
-def publish_until(name: str, at: str, pose, enough) -> None:
-    """Publish a pose again and again, new every time, until enough has come of it."""
+def publish_until(name: str, at: str, pose, enough, make=known_pose) -> None:
+    """Publish a pose again and again, for None a new one that `make` makes, until enough has come of it."""
     publisher = PosePublisher(name, (at,))
     try:
         end = time.monotonic() + 600.0  # only ends a hang
@@ -123,7 +121,7 @@ def publish_until(name: str, at: str, pose, enough) -> None:
             if time.monotonic() > end:
                 pytest.fail("nothing came over the wire")
             now_ns = time.monotonic_ns()
-            publisher.publish(known_pose(t_ns=now_ns, published_ns=now_ns, sequence=k) if pose is None else pose)
+            publisher.publish(make(t_ns=now_ns, published_ns=now_ns, sequence=k) if pose is None else pose)
             if enough():
                 return
             time.sleep(0.01)
@@ -164,15 +162,15 @@ def test_a_ros_reader_gets_the_pose_from_the_process_beside(loopback: str) -> No
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live.bridges import ros2
+    from vislam.live.bridges import ros2, ros2_node, ros2_types
 
     name = f"vislam-test-{uuid.uuid4().hex[:8]}"
     translator = Bridge(LiveConfig(name=name, ros2_domain=_DOMAIN, bridge_rate_hz=1000.0), "ros2")
     domain = Domain(_DOMAIN, f"<CycloneDDS><Domain>{loopback}</Domain></CycloneDDS>")
     participant = DomainParticipant(_DOMAIN)
     readers = {
-        topic: DataReader(participant, Topic(participant, f"rt/{topic}", kind, qos=ros2.QOS), qos=ros2.QOS)
-        for topic, kind in (("odom", ros2.Odometry), ("tf", ros2.TFMessage))
+        topic: DataReader(participant, Topic(participant, f"rt/{topic}", kind, qos=ros2_node.QOS), qos=ros2_node.QOS)
+        for topic, kind in (("odom", ros2_types.Odometry), ("tf", ros2_types.TFMessage))
     }
     got: dict[str, list] = {"odom": [], "tf": []}
 
@@ -237,12 +235,12 @@ def udp_sockets() -> set[tuple[str, bytes]]:
 
 @needs_dds
 def test_a_socket_that_cannot_be_kept_to_loopback_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    from vislam.live.bridges import ros2
+    from vislam.live.bridges import ros2_node
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as open_to_all, pytest.MonkeyPatch.context() as patch:
         open_to_all.bind(("", 0))
         patch.setattr(socket, "SO_BINDTODEVICE", 9999)
-        ros2.hear_loopback_alone([open_to_all.fileno()])
+        ros2_node.hear_loopback_alone([open_to_all.fileno()])
         assert f"port {open_to_all.getsockname()[1]} hears other machines" in caplog.text
 
 
@@ -252,12 +250,12 @@ def test_ros_hears_nothing_of_a_pose_not_to_steer_by(changes: dict) -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live.bridges import ros2
+    from vislam.live.bridges import ros2, ros2_node, ros2_types
 
     wire = ros2.Ros2(_DOMAIN + 30)
     try:
-        topic = Topic(wire._participant, "rt/odom", ros2.Odometry, qos=ros2.QOS)
-        reader = DataReader(wire._participant, topic, qos=ros2.QOS)
+        topic = Topic(wire.node.participant, "rt/odom", ros2_types.Odometry, qos=ros2_node.QOS)
+        reader = DataReader(wire.node.participant, topic, qos=ros2_node.QOS)
         wire.send(known_pose(**changes))
         wire.send(known_pose(T_odom_base=np.eye(4)))
         assert [message.pose.pose.position.x for message in reader.take(N=10)] == [0.0]
@@ -270,13 +268,13 @@ def test_ros_hears_the_health_word_of_every_pose() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live.bridges import ros2
+    from vislam.live.bridges import ros2, ros2_node, ros2_types
 
     wire = ros2.Ros2(_DOMAIN + 31)
     words = [Health.LEVELLED | Health.INVALID, Health.LEVELLED | Health.VISION_OK | Health.DOUBTFUL]
     try:
-        topic = Topic(wire._participant, "rt/vislam/health", ros2.UInt32, qos=ros2.QOS)
-        reader = DataReader(wire._participant, topic, qos=ros2.QOS)
+        topic = Topic(wire.node.participant, "rt/vislam/health", ros2_types.UInt32, qos=ros2_node.QOS)
+        reader = DataReader(wire.node.participant, topic, qos=ros2_node.QOS)
         for word in words:
             wire.send(known_pose(health=word))
         assert [Health(message.data) for message in reader.take(N=10)] == words
@@ -292,16 +290,18 @@ def test_who_comes_later_finds_the_node_and_where_its_sensors_are() -> None:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 
-    from vislam.live.bridges import ros2
+    from vislam.live.bridges import ros2, ros2_node, ros2_types
 
     T_body_cam = transform(_TURN, np.array([0.1, 0.0, 0.2]))
     sensors = translator.sensor_frames(LiveConfig(base_offset_m=(0.0, 0.0, -0.3)), (T_body_cam,))
     wire = ros2.Ros2(_DOMAIN + 33, sensors)
     try:
         other = DomainParticipant(_DOMAIN + 33)
-        static = DataReader(other, Topic(other, "rt/tf_static", ros2.TFMessage, qos=ros2.KEPT), qos=ros2.KEPT)
-        kind = ros2.ParticipantEntitiesInfo
-        nodes = DataReader(other, Topic(other, "ros_discovery_info", kind, qos=ros2.KEPT), qos=ros2.KEPT)
+        static = DataReader(
+            other, Topic(other, "rt/tf_static", ros2_types.TFMessage, qos=ros2_node.KEPT), qos=ros2_node.KEPT
+        )
+        kind = ros2_types.ParticipantEntitiesInfo
+        nodes = DataReader(other, Topic(other, "ros_discovery_info", kind, qos=ros2_node.KEPT), qos=ros2_node.KEPT)
         links, told = (reader.take_one(timeout=600 * 10**9) for reader in (static, nodes))
         people = {one.key.bytes: one.qos for one in BuiltinDataReader(other, BuiltinTopicDcpsParticipant).take(N=10)}
     finally:
@@ -312,24 +312,24 @@ def test_who_comes_later_finds_the_node_and_where_its_sensors_are() -> None:
     np.testing.assert_allclose([where.x, where.y, where.z, q.z, q.w], [0.1, 0.0, 0.5, _HALF, _HALF], atol=1e-12)
     assert people[bytes(told.gid.data[:16])][Policy.Userdata].data == b"enclave=/;"
     (node,) = told.node_entities_info_seq
-    assert (node.node_namespace, node.node_name, len(node.writer_gid_seq)) == ("/", "vislam", 5)
+    assert (node.node_namespace, node.node_name, len(node.writer_gid_seq)) == ("/", "vislam", 7)
 
 
 @needs_dds
 def test_messages_are_those_of_ros_to_the_byte() -> None:
     from rosbags.typesys import Stores, get_typestore
 
-    from vislam.live.bridges import ros2
+    from vislam.live.bridges import ros2, ros2_types
 
     pose = known_pose(health=Health.LEVELLED | Health.DEAD_RECKONING)
-    gid = ros2.Gid(list(range(ros2.GID_BYTES)))
-    node = ros2.NodeEntitiesInfo("/", "vislam", [], [gid, gid])
+    gid = ros2_types.Gid(list(range(ros2_types.GID_BYTES)))
+    node = ros2_types.NodeEntitiesInfo("/", "vislam", [], [gid, gid])
     for name, message in {
         "nav_msgs/msg/Odometry": ros2.odometry(pose, 5),
         "tf2_msgs/msg/TFMessage": ros2.transforms(pose, 6),
-        "std_msgs/msg/UInt32": ros2.UInt32(7),
+        "std_msgs/msg/UInt32": ros2_types.UInt32(7),
         "diagnostic_msgs/msg/DiagnosticArray": ros2.diagnosis(pose, 8),
-        "rmw_dds_common/msg/ParticipantEntitiesInfo": ros2.ParticipantEntitiesInfo(gid, [node]),
+        "rmw_dds_common/msg/ParticipantEntitiesInfo": ros2_types.ParticipantEntitiesInfo(gid, [node]),
     }.items():
         store, data = get_typestore(Stores.ROS2_JAZZY), message.serialize(use_version_2=False)
         assert bytes(store.serialize_cdr(store.deserialize_cdr(data, name), name)) == data, name

@@ -1,7 +1,5 @@
 """The pose's process asks the system to let it run soon, whatever the system makes of that."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -12,7 +10,7 @@ import pytest
 _CODE = """
 import os
 from pathlib import Path
-from vislam.live.priority import take_short_turns
+from vislam.live.processes.fast import take_short_turns
 before = os.nice(3), os.sched_getscheduler(0)
 take_short_turns()
 print(before == (os.nice(0), os.sched_getscheduler(0)))

@@ -1,7 +1,5 @@
 """Whole live runs in real processes, on simulated vision played in real time; nothing here asserts how long it took."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -11,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from live_runs import FILES, Notes, has_map, interrupt, left_behind, settings, status, until
+from live_runs import FILES, PATIENCE_S, WORLD, Notes, has_map, interrupt, left_behind, settings, status, until
 
 from vislam.config import load
 from vislam.core.errors import HardwareError, TrackingLostError, UsageError, VislamError
@@ -41,9 +39,10 @@ def start(
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list[Health]]:
     """A run to its end in which the IMU and then the camera are unplugged, and the health that was seen on the way."""
     outages = Outages(imu=((8.0, 9.0),), camera=((11.0, 13.0),))
-    live, out = start(tmp_path_factory.mktemp("live"), "whole", outages, dense=True)
+    live, out = start(tmp_path_factory.mktemp("live"), "whole", outages, WORLD, dense=True)
     live.notes = Notes()
-    metrics = live.execute(duration_s=16.0)
+    lasted_16_s = until(lambda run: status(run).get("samples", 0) > 3000 and has_map(run), LiveRun.stop)
+    metrics = live.execute(lasted_16_s, PATIENCE_S)
     assert left_behind("whole") == []
     return out, metrics, live.notes.health
 

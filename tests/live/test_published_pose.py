@@ -1,9 +1,9 @@
 """What a controller reads: the struct, its C header, shared memory, datagrams, prediction."""
 
-from __future__ import annotations
-
 import errno
+import grp
 import os
+import pwd
 import shutil
 import stat
 import subprocess
@@ -75,11 +75,12 @@ def test_garbage_is_refused(data: bytes) -> None:
 _PROGRAM = r"""
 #include "vislam_pose.h"
 #include <stdio.h>
+#include <stdlib.h>
 #define FIELD(name) printf("%zu ", offsetof(vislam_pose, name));
 int main(int count, char **path) {
     FIELDS
     printf("\n");
-    const vislam_pose_slot *slot = vislam_pose_open(path[1]);
+    const vislam_pose_slot *slot = vislam_pose_open_of(path[1], count > 2 ? atoi(path[2]) : 0);
     vislam_pose pose;
     if (slot == NULL) return 3;
     if (!vislam_pose_read(slot, &pose)) return 2;
@@ -105,6 +106,9 @@ def test_the_c_header_reads_what_is_published(tmp_path: Path) -> None:
         if os.geteuid() == 0:
             os.chown(f"/dev/shm/{name}", 54321, -1)
             assert subprocess.run([str(program), f"/dev/shm/{name}"], check=False).returncode == 3
+            assert subprocess.run([str(program), f"/dev/shm/{name}", "54321"], check=False).returncode == 0
+        os.chmod(f"/dev/shm/{name}", 0o660)
+        assert subprocess.run([str(program), f"/dev/shm/{name}", "54321"], check=False).returncode == 3
         assert subprocess.run([str(program), f"/dev/shm/{name}-none"], check=False).returncode == 3
     finally:
         publisher.close()
@@ -259,6 +263,38 @@ def test_memory_and_sockets_belong_to_their_user(tmp_path: Path, monkeypatch: py
     finally:
         writer.close()
         listener.close()
+
+
+def test_a_group_that_is_named_may_read_and_an_owner_who_is_named_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, at = f"vislam-test-{uuid.uuid4().hex}", tmp_path / "a.sock"
+    path, group = Path(f"/dev/shm/{name}"), grp.getgrgid(os.getegid()).gr_name
+    user = pwd.getpwnam("nobody") if os.geteuid() == 0 else pwd.getpwuid(os.geteuid())
+    writer, listener = SlotWriter(name, 8, group), PoseListener(f"unix:{at}", group)
+    try:
+        assert [(stat.S_IMODE(p.stat().st_mode), p.stat().st_gid) for p in (path, at)] == [
+            (0o640, os.getegid()),
+            (0o660, os.getegid()),
+        ]
+        writer.write(b"ours")
+        os.chown(path, user.pw_uid, -1)
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+        with pytest.raises(DataError, match="is that of user"):
+            SlotReader(name)
+        assert SlotReader(name, user.pw_name).read() == (1, b"ours")
+        path.chmod(0o660)
+        with pytest.raises(DataError, match="is open to others, who may write anything into it"):
+            SlotReader(name, user.pw_name)
+    finally:
+        writer.close()
+        listener.close()
+    for make in (lambda: SlotWriter(name, 8, "no-such-group"), lambda: PoseListener(f"unix:{at}", "no-such-group")):
+        with pytest.raises(UsageError, match="group no-such-group: no such group"):
+            make()
+    with pytest.raises(UsageError, match="no user no-such-user"):
+        PoseReader(name, "no-such-user")
+    assert not at.exists() and not [left for left in Path("/dev/shm").iterdir() if name in left.name]
 
 
 def test_poses_are_not_sent_to_who_was_first_at_a_name_in_tmp(monkeypatch: pytest.MonkeyPatch) -> None:

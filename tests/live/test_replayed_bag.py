@@ -1,7 +1,5 @@
 """Bags played as if their sensors were plugged in: with what a bag lacks told, and without keeping what was played."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 

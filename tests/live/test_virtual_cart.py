@@ -1,7 +1,5 @@
 """The virtual cart: exact motion in every process, who steers it, what can be asked of it, and a whole run."""
 
-from __future__ import annotations
-
 import os
 import signal
 import tempfile
@@ -22,12 +20,10 @@ from vislam.live.epoch import Epoch
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
 from vislam.live.status import status_line
-from vislam.live.virtual.cart import VirtualCart
+from vislam.live.virtual.cart import VirtualCart, VirtualReadings
 from vislam.live.virtual.imu import _truth, open_board, run_board
 from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower, Segment
-from vislam.live.virtual.pilot import CommandReader, CommandWriter, PathFollower
-from vislam.live.virtual.place import course
-from vislam.live.virtual.virtual_readings import VirtualReadings
+from vislam.live.virtual.pilot import CommandReader, CommandWriter
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import PoseListener
 from vislam.live.wire.slot import SlotWriter
@@ -91,7 +87,7 @@ def test_other_processes_see_the_same_motion_and_chips_its_derivatives() -> None
         for k in range(60):
             drive.advance(0.05 * k, 0.6, 0.8 if k > 20 else 0.0)
         assert follower.at(2.5) == drive.at(2.5)
-        truth, begin_ns, h = _truth(follower, epoch, 9.81), epoch.begin_ns(), 1e-4
+        truth, begin_ns, h = _truth(follower, epoch.peek_ns, 9.81), epoch.begin_ns(), 1e-4
         for t_s in (0.312, 1.21, 2.03):
             before, here, after = (drive.at(t_s + d) for d in (-h, 0.0, h))
             rate, force, _, _ = truth(begin_ns + round(t_s * 1e9))
@@ -120,36 +116,20 @@ def test_who_follows_waits_for_the_first_segment() -> None:
         slot.close()
 
 
-def test_the_pilot_drives_the_course_to_its_end() -> None:
-    way = course(1)
-    follower, drive, errors = PathFollower(way), Drive(f"vislam-test-{uuid.uuid4().hex}", *way[0].tolist(), 0.0), []
-    try:
-        for k in range(4000):
-            here = drive.at(0.02 * k)
-            speed, rate, is_done = follower.command(here.x_m, here.y_m, here.yaw_rad)
-            if is_done:
-                break
-            drive.advance(0.02 * k, speed, rate)
-            errors.append(follower.error_m(here.x_m, here.y_m))
-    finally:
-        drive.close()
-    assert is_done
-    assert follower.length_m > 20.0
-    assert max(errors) < 0.25
-
-
-def test_commands_that_nobody_renews_are_not_obeyed() -> None:
+def test_commands_that_nobody_renews_are_not_obeyed_nor_those_that_are_no_numbers() -> None:
     name = f"vislam-test-{uuid.uuid4().hex}"
-    reader = CommandReader(name, timeout_s=0.5)
+    reader = CommandReader(name)
     assert reader.newest(0.0) == (0.0, 0.0)
     writer = CommandWriter(name)
     try:
         writer.command(0.4, -0.2)
         assert reader.newest(1.0) == (0.4, -0.2)
-        assert reader.newest(1.4) == (0.4, -0.2)
-        assert reader.newest(1.6) == (0.0, 0.0)
+        assert reader.newest(1.29) == (0.4, -0.2)
+        assert reader.newest(1.31) == (0.0, 0.0)
         writer.command(0.4, -0.2)
         assert reader.newest(2.0) == (0.4, -0.2)
+        writer.command(float("nan"), 0.1)
+        assert reader.newest(2.1) == (0.0, 0.0)
     finally:
         writer.close()
 
@@ -220,7 +200,7 @@ def test_without_a_camera_attitude_is_published_and_the_bias_kept_until_ctrl_c(t
                 interrupted.append(True)
                 os.kill(os.getpid(), signal.SIGINT)
 
-    metrics = live.execute(watch, duration_s=60.0)
+    metrics = live.execute(watch, duration_s=600.0)
     last = Health(told[-1]["health"])
     assert interrupted and Health.LEVELLED in last and Health.CAMERA_MISSING not in last
     assert all(Health.INVALID in Health(status["health"]) for status in told)
@@ -281,7 +261,7 @@ def test_a_whole_run_of_the_virtual_cart(tmp_path: Path) -> None:
                 run.stop()
 
     live = LiveRun(source, config, out, asked, ["vislam", "live"])
-    metrics = live.execute(until_plugged_in_again, duration_s=60.0)
+    metrics = live.execute(until_plugged_in_again, duration_s=600.0)
     assert metrics["mode"] == "planar"
     assert metrics["frames"] > 5
     late = {role: cost["late_kernels"] for role, cost in metrics["cost"]["processes"].items()}
@@ -316,7 +296,7 @@ def test_a_ride_through_the_serial_bridge_and_its_unplugged_port(tmp_path: Path)
     ear = threading.Thread(target=hear)
     ear.start()
     try:
-        metrics = LiveRun(source, config, out, asked, ["vislam", "live"]).execute(until_it_sees_again, 60.0)
+        metrics = LiveRun(source, config, out, asked, ["vislam", "live"]).execute(until_it_sees_again, 600.0)
     finally:
         ended.set()
         ear.join()
@@ -356,6 +336,10 @@ def test_a_chip_behind_its_bridge_may_freeze(tmp_path: Path) -> None:
             assert time.monotonic() < end, bridge.counters()
             bridge.read(0.05)
             seen |= bridge.health()
+        stop.set()
+        board.join(0.2)
+        bridge.read(0.05)
+        assert bridge.counters().get("port_lost", 0) == 0, "the board stays for a reader that ends later"
         bridge.close()
     finally:
         stop.set()

@@ -1,20 +1,19 @@
 """What a page gets of a run: bounded however long the run is, and nobody waits for a page that takes nothing."""
 
-from __future__ import annotations
-
 import base64
 import json
 import multiprocessing
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from vislam.core.messages import Array, Tracking
+from vislam.core.messages import Tracking
 from vislam.hw.health import Health
+from vislam.live.processes.front import FrameShare, picture
 from vislam.live.web import feed as feed_module
 from vislam.live.web.feed import MOST_POINTS, Feed
-from vislam.live.web.frame_share import FrameShare, picture
 from vislam.live.web.map_share import SAVED, MapShare, quantised
 from vislam.live.web.updates import FrameUpdate, KeyframeCloud, LoopUpdate, MapUpdate, Save, Saved, Status, StepPicture
 from vislam.live.wire.mail import Inbox
@@ -50,7 +49,7 @@ def points_of(clouds: dict) -> int:
     return sum(len(base64.b64decode(entry["rgb"])) // 2 for entry in clouds.values())
 
 
-def pose_at(position: Array, health: Health = Health.LEVELLED, sigma: float = 0.1) -> PublishedPose:
+def pose_at(position: np.ndarray, health: Health = Health.LEVELLED, sigma: float = 0.1) -> PublishedPose:
     T = np.eye(4)
     T[:3, 3] = position
     covariance = np.diag(np.full(6, sigma))
@@ -135,12 +134,14 @@ def test_loops_status_and_what_was_saved_are_told() -> None:
     feed = Feed()
     feed.take(Status({"phase": "running"}))
     feed.take(Saved("saved/cloud.ply"))
-    feed.take(MapUpdate(1, {}, {}, {}, [LoopUpdate(1, 9, "pending", "waits"), LoopUpdate(1, 9, "accepted", "agrees")]))
+    loops = [LoopUpdate(1, 9, "odometry", "pending", "waits"), LoopUpdate(1, 9, "odometry", "accepted", "agrees")]
+    feed.take(MapUpdate(1, {}, {}, {}, loops, {"accepted": 1}))
     state = feed.state({})
     assert state["phase"] == "running"
     assert feed.is_going
     assert state["saved"][0]["text"] == "saved/cloud.ply"
-    assert feed.map({})["loops"] == [[1, 9, "accepted", "agrees"]]
+    assert feed.map({})["loops"] == [[1, 9, "accepted", "agrees", -1]]
+    assert state["map"]["loops"] == {"accepted": 1}
 
 
 def test_a_cloud_is_the_same_every_time_and_never_wraps_around() -> None:
@@ -174,14 +175,15 @@ def keyframe_step(keyframe_id: int):
         color=None, images=()), keypoints_px=np.zeros((5, 2)))  # fmt: skip
     update = SimpleNamespace(revision=1, ids=np.array([keyframe_id]), T_map_body=np.eye(4)[None], T_map_odom=np.eye(4))
     odometry = SimpleNamespace(packet=SimpleNamespace(keyframe=keyframe), T_odom_body=np.eye(4))
-    return SimpleNamespace(odometry=odometry, update=update, candidates=[], scans={})
+    return SimpleNamespace(odometry=odometry, update=update, candidates=[], edges=[],
+                           record=SimpleNamespace(loops=()), scans={})  # fmt: skip
 
 
 @pytest.mark.parametrize("is_dead", [True, False])
 def test_nobody_waits_for_a_page_that_takes_nothing_and_no_memory_is_spent_on_it(
     tmp_path, monkeypatch, is_dead
 ) -> None:
-    monkeypatch.setattr("vislam.live.web.frame_share._FRAME_S", 0.0)
+    monkeypatch.setattr("vislam.live.processes.front._FRAME_S", 0.0)
     hears, says = multiprocessing.Pipe()
     if is_dead:
         hears.close()
@@ -248,3 +250,48 @@ def test_before_the_first_keyframe_there_is_little_to_save_and_a_folder_that_can
         saved.append(answer(MapShare(wire, out), Inbox(page)))
     assert [told.is_well for told in saved] == [True, False]
     assert "not saved" in saved[1].text
+
+
+@pytest.mark.parametrize(
+    ("status", "pose", "state", "text"),
+    [
+        ({"phase": "waiting"}, None, "plain", "The run waits for Start."),
+        ({"phase": "getting ready", "line": "getting ready: compiling"}, None, "plain", "Getting ready: compiling."),
+        ({"phase": "running"}, {}, "trusted", "Trusted, ± 0.55 m: nothing in the run contradicts itself."),
+        (
+            {"phase": "running", "verdict": {"state": "doubtful", "reasons": ["it is dark: 3 of 4", "it shakes", "c"]}},
+            {}, "doubtful", "Doubtful, ± 0.55 m: it is dark, and 2 more reasons.",
+        ),
+        (
+            {"phase": "running"}, {"health": Health.INVALID | Health.DEAD_RECKONING, "vision_age_s": 2.0}, "invalid",
+            "Invalid, ± 0.55 m: nothing has corrected it for 2.0 s; vision is lost: dark. Do not steer by it.",
+        ),
+        (
+            {"phase": "running"}, {"health": Health.INVALID | Health.IMU_MISSING}, "invalid",
+            "Invalid, ± 0.55 m: no samples come from the IMU. Do not steer by it.",
+        ),
+        ({"phase": "ended", "verdict": {"state": "lost", "reasons": ["dark"]}}, {}, "lost", "Lost: dark."),
+    ],
+)  # fmt: skip
+def test_the_page_begins_with_what_the_pose_is_worth(status: dict, pose: dict | None, state: str, text: str) -> None:
+    feed = Feed()
+    feed.take(Status(status))
+    feed.take(FrameUpdate(5, b"", "lost", 3, "dark"))
+    if pose is not None:
+        feed.follow(replace(pose_at(np.zeros(3)), **pose))
+    line = feed.state({})["headline"]
+    assert (line["state"], line["text"]) == (state, text)
+    assert ("sigma" in line) == (state == "invalid")
+
+
+def test_all_times_count_from_the_first_frame_of_the_run() -> None:
+    feed = Feed()
+    notices = [("info", "ready", 4 * 10**9), ("warning", "dark", 7 * 10**9)]
+    feed.take(Status({"phase": "running", "notices": notices}))
+    assert [notice[2] for notice in feed.state({})["notices"]] == [None, None]  # there is no first frame yet
+    feed.follow(replace(pose_at(np.zeros(3)), t_ns=5 * 10**9))
+    feed.take(Status({"phase": "running", "notices": notices, "zero_ns": 6 * 10**9}))  # as the run's own files count
+    feed.follow(replace(pose_at(np.zeros(3)), t_ns=8 * 10**9))
+    state = feed.state({})
+    assert [notice[2] for notice in state["notices"]] == [None, 1.0]
+    assert state["pose"]["t_s"] == 2.0

@@ -1,13 +1,11 @@
 """The page of a live run as a stranger meets it: who is let in, what a request may be, and how much of it."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
@@ -18,6 +16,7 @@ from vislam.live.web.feed import Feed
 from vislam.live.web.server import WebServer, as_json
 from vislam.live.web.web_gate import Gate, new_token
 from vislam.live.web.web_process import routes
+from waiting import wait_for
 
 _TOKEN = "Zk3vQ9-this-is-a-token-of-tests_0aB7"  # a drawn one would name tests anew in each worker
 _MOST, _REQUEST_S = 6, 0.5
@@ -59,14 +58,6 @@ class Site:
             except ConnectionResetError:
                 pass
             return said
-
-
-def wait_for(is_so: Callable[[], bool]) -> None:
-    """Wait until something is so; the limit only ends a hang."""
-    deadline = time.monotonic() + _HANG_S
-    while not is_so():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")

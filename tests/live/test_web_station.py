@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import logging
-import time
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,12 +12,16 @@ from urllib.parse import urlsplit
 
 import psutil
 import pytest
+from numba import njit
 
 from vislam.cli import run_verb
 from vislam.core.errors import UsageError
+from vislam.live.processes.child import measured
+from vislam.live.status import status_line
 from vislam.live.web.address import parsed
 from vislam.live.web.station import Station
 from vislam.runs.folder import prepare
+from waiting import wait_for
 
 
 def ask(station: Station, method: str, path: str, body: dict | None = None) -> tuple[int, dict]:
@@ -28,13 +31,6 @@ def ask(station: Station, method: str, path: str, body: dict | None = None) -> t
         connection.request(method, path, None if body is None else json.dumps(body), headers)
         answer = connection.getresponse()
         return answer.status, json.loads(answer.read())
-
-
-def until(is_so) -> None:
-    deadline = time.monotonic() + 300.0  # only ends a hang
-    while not is_so():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @pytest.fixture
@@ -61,18 +57,18 @@ def test_a_run_is_told_of_and_ended_from_the_page_and_outlives_it(station: Stati
         station.follow(run)
         return ask(station, "GET", "/state")[1]
 
-    until(lambda: told().get("phase") == "running")
+    wait_for(lambda: told().get("phase") == "running")
     assert told()["verdict"]["reasons"] == ["it is <b>dark</b>"]
     assert {"stop", "save"} == {*told()["can"]}
     assert ask(station, "POST", "/command", {"do": "stop"})[0] == 202
-    until(lambda: (station.follow(run), run.stopped)[1] == 1)
+    wait_for(lambda: (station.follow(run), run.stopped)[1] == 1)
 
     pages = [p for p in psutil.Process().children() if "spawn_main" in " ".join(p.cmdline())]
     assert len(pages) == 1
     pages[0].kill()
     monkeypatch.setattr("vislam.live.web.station._SHOW_S", 0.0)
     with caplog.at_level(logging.WARNING):
-        until(lambda: (station.follow(run), not station.is_well)[1])
+        wait_for(lambda: (station.follow(run), not station.is_well)[1])
         for _ in range(20):
             station.follow(run)
     assert sum("the run goes on without the page" in record.message for record in caplog.records) == 1
@@ -82,7 +78,8 @@ def test_a_run_is_told_of_and_ended_from_the_page_and_outlives_it(station: Stati
     "said",
     [
         {}, {"do": "shell"}, {"do": ["stop"]}, {"do": None}, {"do": "calibrate", "kind": ["imu"]},
-        {"do": "calibrate", "kind": "x" * 65}, {"do": "calibrate", **{str(k): "x" for k in range(9)}},
+        {"do": "calibrate", "kind": "x" * 65}, {"do": "undo"}, {"do": "undo", "loop": "-1"}, {"do": "undo", "loop": 7},
+        {"do": "calibrate", **{str(k): "x" for k in range(9)}},
     ],
 )  # fmt: skip
 def test_what_is_no_command_is_refused_and_reaches_nobody(said: dict) -> None:
@@ -90,7 +87,7 @@ def test_what_is_no_command_is_refused_and_reaches_nobody(said: dict) -> None:
 
     taken: list[object] = []
     box = SimpleNamespace(put=lambda value: taken.append(value) or True)
-    assert _Commands(box, box).take(said).status == 400
+    assert _Commands(box, box, box).take(said).status == 400
     assert taken == []
 
 
@@ -98,8 +95,8 @@ def test_commands_that_nobody_takes_are_bounded() -> None:
     from vislam.live.web.web_process import _Commands
 
     full = SimpleNamespace(put=lambda value: False)
-    assert _Commands(full, full).take({"do": "stop"}).status == 503
-    assert _Commands(full, full).take({"do": "save"}).status == 503
+    for said in ({"do": "stop"}, {"do": "save"}, {"do": "undo", "loop": "7"}):
+        assert _Commands(full, full, full).take(said).status == 503
 
 
 @pytest.mark.parametrize("at", ["8765", "no such:1", "no-such-host.invalid:80", "203.0.113.7:80"])
@@ -121,3 +118,22 @@ def test_a_folder_that_holds_calibrations_only_takes_a_run_and_keeps_them(tmp_pa
     (out / "other.txt").write_text("somebody's")
     with pytest.raises(UsageError):
         prepare(out, overwrite=False)
+
+
+def test_what_is_compiled_is_counted_and_the_page_says_how_long_that_may_take() -> None:
+    run, notes = run_that_goes(), []
+
+    def body(life: SimpleNamespace) -> None:
+        def kernel(x: float) -> float:
+            return x + 1.0
+
+        kernel.__module__ = "vislam.made_up"
+        njit(kernel)(1.0)
+
+    measured(SimpleNamespace(note=lambda **values: notes.append(values)), body)
+    run.is_going, run.waits_for = False, ["front"]
+    assert status_line(run) == "getting ready: loading front: under a minute unless the machine is busy"
+    run.notes = {"front": {**notes[0]}, "fast": {"compiled": 2}}
+    line = status_line(run)
+    assert line.startswith("getting ready: compiling, once for this machine: 3 functions so far, 5 minutes or so")
+    assert line.endswith("waiting for front")

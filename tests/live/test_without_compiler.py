@@ -1,7 +1,5 @@
 """The filter without a compiler (NUMBA_DISABLE_JIT=1): the same answers from the same source, slower."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -16,6 +16,7 @@ from vislam.core.errors import DataError
 from vislam.loop.view import View
 from vislam.loop.words.database import PlaceDatabase, seed_vocabulary
 from vislam.loop.words.vocabulary import train
+from waiting import wait_for
 
 CONFIG = LoopConfig()
 NOTHING = np.empty(0, dtype=np.int64)
@@ -144,10 +145,7 @@ def test_closing_ends_the_thread_and_raises_what_failed(monkeypatch: pytest.Monk
         else:
             with pytest.raises(error):
                 database.close()
-        deadline = time.monotonic() + 600.0
-        while workers() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert not workers()
+        wait_for(lambda: not workers())
         database.close()  # twice does no harm
 
 

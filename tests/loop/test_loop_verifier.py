@@ -249,8 +249,8 @@ def test_a_pair_without_depth_and_with_too_few_matches_is_not_searched(world: La
     assert found.reason == f"too few matches: {found.matches}, needs 10000 without depth"
 
 
-def test_of_equal_panels_the_one_where_the_map_has_it_is_found() -> None:
-    """View b sees the second of two panels, whose descriptors are nearer to those of the first."""
+def two_panels() -> tuple[View, View, Array, Verifier]:
+    """Views a of two equal panels and b of the second, whose descriptors are nearer to the first; the truth."""
     rng, rig = np.random.default_rng(6), make_rig()
     panel, bits = (
         rng.uniform([-0.6, -0.8, 3.0], [0.6, 0.8, 3.6], (60, 3)),
@@ -266,9 +266,21 @@ def test_of_equal_panels_the_one_where_the_map_has_it_is_found() -> None:
 
     a = view(0, np.vstack([panel, panel + step]), np.vstack([bits, second]))
     b = view(1, panel + step - T_cams[:3, 3], bits)
-    verifier = Verifier(LoopConfig(), rig, 0)
-    T_true = rig.T_body_cams[0] @ T_cams @ invert(rig.T_body_cams[0])
+    return a, b, rig.T_body_cams[0] @ T_cams @ invert(rig.T_body_cams[0]), Verifier(LoopConfig(), rig, 0)
+
+
+def test_of_equal_panels_the_one_where_the_map_has_it_is_found() -> None:
+    a, b, T_true, verifier = two_panels()
     alone, guided = verifier.verify(a, b), verifier.verify(a, b, None, T_true)
-    assert alone.T_a_b is not None and guided.T_a_b is not None
     assert np.linalg.norm(alone.T_a_b[:3, 3] - T_true[:3, 3]) > 1.0
     np.testing.assert_allclose(guided.T_a_b, T_true, atol=0.02)
+
+
+def test_a_place_that_looks_like_itself_a_step_further_has_a_rival_there(world: LandmarkWorld) -> None:
+    a, b, T_true, verifier = two_panels()
+    (rival,) = verifier.rivals(a, b, verifier.verify(a, b))
+    np.testing.assert_allclose(rival.T_a_b, T_true, atol=0.02)
+    (back,) = verifier.rivals(a, b, verifier.verify(a, b, None, T_true))
+    assert np.linalg.norm(back.T_a_b[:3, 3] - T_true[:3, 3]) == pytest.approx(1.5, abs=0.05)
+    (c, d, _), plain = views(world, np.random.default_rng(4)), Verifier(LoopConfig(), world.rig, 0)
+    assert plain.rivals(c, d, plain.verify(c, d)) == []

@@ -180,17 +180,18 @@ def test_a_tree_that_cannot_be_one_is_refused(vocabulary: Vocabulary, tmp_path: 
         Vocabulary.load(tmp_path / "v.npz")
 
 
-def test_a_file_that_claims_gigabytes_is_refused_unread(tmp_path: Path) -> None:
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<u8", "fortran_order": False, "shape": (2**26, 4)})
-    with (
-        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("nodes.npy", "w", force_zip64=True) as member,
-    ):
-        member.write(header.getvalue())
-        for _ in range(600):
-            member.write(bytes(2**20))
-    with pytest.raises(DataError, match="limit"):
+@pytest.mark.parametrize(("rows", "mib", "why"), [(2**26, 600, "limit"), (2**50, 0, "cannot reshape")])
+def test_a_file_that_claims_gigabytes_is_refused_unread(rows: int, mib: int, why: str, tmp_path: Path) -> None:
+    header, version = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<u8", "fortran_order": False, "shape": (rows, 4)})
+    np.save(version, np.int64(1))
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("format.npy", version.getvalue())
+        with archive.open("nodes.npy", "w", force_zip64=True) as member:
+            member.write(header.getvalue())
+            for _ in range(mib):
+                member.write(bytes(2**20))
+    with pytest.raises(DataError, match=why):
         Vocabulary.load(tmp_path / "bomb.npz")
 
 

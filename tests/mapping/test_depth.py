@@ -10,8 +10,8 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp, transform, transform_points
 from vislam.core.memory import PackedScan
 from vislam.mapping.cloud.store import KeyframeStore, Scan
+from vislam.mapping.depth.extract import DenseStereo
 from vislam.mapping.depth.image import filter_depth, rgbd_view, scan_points, surface_points
-from vislam.mapping.depth.stereo import DenseStereo
 from worlds.box import CAMERA, CONFIG, RIG, T_BODY_CAM0, depth_image, pose
 
 VIEW = rgbd_view(RIG, CONFIG)

@@ -1,7 +1,5 @@
 """Depth images that were taken beside their image are put where the image sees them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

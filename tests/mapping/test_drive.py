@@ -5,7 +5,7 @@ import pytest
 
 from vislam.config import DriveConfig, MapConfig
 from vislam.core.errors import DataError
-from vislam.mapping.drive.drive import Drive, DriveMap
+from vislam.mapping.drive.drive_grid import Drive, DriveMap
 from vislam.mapping.octree import ColumnStore
 from vislam.mapping.octree.occupancy import Octree
 

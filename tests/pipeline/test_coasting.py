@@ -1,16 +1,13 @@
 """Where a body goes that nothing measures: the spread that is stated covers how far motions really are from habit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from vislam import Frame, Observations
+from vislam.core import Tracking, VoMeasurement, invert, se3_log, so3_exp, transform
 from vislam.core.chi_square import chi_square_limit
-from vislam.core.geometry import invert, se3_log, so3_exp, transform
-from vislam.core.messages import Tracking, VoMeasurement
 from vislam.frontend import TrackResult
 from vislam.pipeline.chain import KeyframeChain
 from vislam.pipeline.coasting import Coasting

@@ -1,7 +1,5 @@
 """The published pose: at rest it stays, in motion it follows, and what is corrected is not seen as motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -159,6 +159,23 @@ def test_a_place_that_is_told_is_found_on_other_wallpaper_by_depth_alone(old, tm
     assert errors_m(tmp_path / "new", poses).max() < 0.03
 
 
+def test_a_place_that_is_told_on_the_way_is_found_as_well(old):
+    poses = path(24)[2:]
+    recording = film(other_noise(8), poses)
+    config = derived(load(None, {**SETTINGS, "up": "none"}), recording.rig, None)
+    stored = Session(old / "session.db")
+    slam = Slam(config, recording.rig)
+    slam.begin_in_map(map_of(stored, recording, config, None, True))
+    stored.close()
+    joined = []
+    for k, frame in enumerate(recording.events()):
+        if k == 5:
+            slam.back.guess(poses[k] @ se3_exp(np.array([0.0, 0.07, 0.0, 0.08, 0.0, -0.06])))
+        joined += [keyframe.update.submaps.is_joined for step in slam.feed(frame) for keyframe in step.keyframes]
+    assert not joined[0] and joined[-1]
+    assert slam.back.counters["depth in map"]["offered"] > 0
+
+
 def test_another_room_gets_no_edge_by_depth_whatever_place_is_told(old, tmp_path, monkeypatch):
     monkeypatch.setattr(corner, "_PLANES", OTHER_ROOM)
     poses = path(24)[2:]

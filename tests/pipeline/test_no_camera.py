@@ -1,7 +1,5 @@
 """Runs without a camera, on a simulated cart whose truth is exact."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The front half with planar odometry: start, rest, drive, a floor whose texture ends, a clock that is late."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 

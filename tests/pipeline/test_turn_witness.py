@@ -1,7 +1,5 @@
 """Turns by wheels against the gyroscope's, of a motion whose rates are known exactly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A run that begins in the map of an earlier session: found there, extending it or leaving it as it is."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -170,7 +170,7 @@ def test_points_lie_where_depth_is(run: Path) -> None:
         if depth_m is None:
             return  # a stereo rig has none to compare with
         x, y = np.rint(seen[row]).astype(int)
-        off.append(z[row] / depth_m[y, x] - 1.0)
+        off.append(depth_m[y, x] / z[row] - 1.0)  # -1 where there is no depth
     assert np.median(np.abs(off)) < 0.02
 
 

@@ -1,7 +1,5 @@
 """Sessions joined into one pose graph by loops between them: truth in one frame, refusals, determinism."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

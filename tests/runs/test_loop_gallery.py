@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from vislam.core.memory import LoopPlace
 from vislam.core.messages import Frame, GraphUpdate, Keyframe, LoopCandidate, LoopDecision, LoopEdge
-from vislam.loop.injection import FIRST_ID, as_candidate
-from vislam.loop.table import LoopRow, caption
+from vislam.loop import LoopRow, as_candidate, caption
+from vislam.loop.injection import FIRST_ID
 from vislam.runs import loop_gallery
 from vislam.runs.folder import RunLog
 from vislam.runs.loop_gallery import LoopGallery, chosen
@@ -30,7 +31,9 @@ def step(identifier, candidates=(), image=None):
     frame = Frame(identifier, identifier, () if image is False else (image,))
     keyframe = Keyframe(identifier, identifier, frame, np.zeros((0, 2)), np.zeros((0, 32), np.uint8), None)
     return SimpleNamespace(
-        odometry=SimpleNamespace(packet=SimpleNamespace(keyframe=keyframe)), candidates=list(candidates)
+        odometry=SimpleNamespace(packet=SimpleNamespace(keyframe=keyframe)),
+        candidates=list(candidates),
+        record=SimpleNamespace(loops=()),
     )
 
 
@@ -111,18 +114,36 @@ def test_a_picture_that_cannot_be_written_says_so(tmp_path):
         gallery.write(tmp_path, [row(0, 2)])
 
 
-def test_what_an_accepted_loop_moved_is_told_with_it():
-    def keyframe_step(k, x_m, moved, accepted=(), edges=(), candidates=()):
-        pose = np.eye(4)
-        pose[0, 3] = x_m
-        poses = np.tile(np.eye(4), (len(moved), 1, 1))
-        poses[:, 0, 3] = list(moved.values())
-        update = GraphUpdate(k, np.array(list(moved), np.int64), poses, np.eye(4), None, accepted)
-        told = step(k, candidates)
-        told.odometry.packet.imu, told.odometry.T_odom_body = None, pose
-        told.update, told.edges, told.retrieved = update, list(edges), []
-        return told
+def keyframe_step(k, x_m, moved, accepted=(), edges=(), candidates=(), states=()):
+    """A keyframe along x, what its update moved where to, and the loops that this took in."""
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    poses = np.tile(np.eye(4), (len(moved), 1, 1))
+    poses[:, 0, 3] = list(moved.values())
+    update = GraphUpdate(k, np.array(list(moved), np.int64), poses, np.eye(4), None, accepted)
+    told = step(k, candidates)
+    told.odometry.packet.imu, told.odometry.T_odom_body = None, pose
+    told.update, told.edges, told.retrieved, told.record = update, list(edges), [], SimpleNamespace(loops=states)
+    return told
 
+
+def test_of_loops_that_one_update_took_in_each_has_its_own_share_and_redundant_ones_none():
+    def edge(i, a, b, variance):
+        return LoopEdge(i, a, b, np.eye(4), variance * np.eye(6), True, 30, 0.5)
+
+    spare = SimpleNamespace(id=9, place=LoopPlace.SPARE)
+    log = RunLog()
+    for k in range(3):
+        log.add_keyframe(keyframe_step(k, float(k), {k: float(k)}))
+    edges = [edge(6, 0, 3, 1.0), edge(7, 1, 3, 0.5), edge(8, 0, 1, 0.1), edge(9, 2, 3, 0.01)]
+    log.add_keyframe(keyframe_step(3, 3.0, {2: 2.2, 3: 3.4}, (6, 7, 8, 9), edges, states=[spare]))
+    largest = {i: shift[1] for i, shift in log.shifts([6, 7, 8, 9]).items()}
+    assert sum(largest.values()) == pytest.approx(0.2)  # of keyframe 2, which was in the map
+    assert largest[7] == pytest.approx(2.0 * largest[6])  # it is twice as certain, and the motion is the same
+    assert largest[8] == largest[9] == 0.0  # its ends did not move against each other; and one is redundant
+
+
+def test_what_an_accepted_loop_moved_is_told_with_it():
     accepted = replace(candidate(0, 2), decision=LoopDecision.ACCEPTED)
     edge = LoopEdge(7, 0, 2, np.eye(4), np.eye(6), True, 30, 0.5)
     log = RunLog()

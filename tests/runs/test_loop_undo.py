@@ -1,7 +1,5 @@
 """`vislam loops`: edges listed, undone and brought back, through the graph that the session stored."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

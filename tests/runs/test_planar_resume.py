@@ -1,7 +1,5 @@
 """A run over a floor that was stopped in the middle goes on as if it had not been: pose, tilt of the camera, clock."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,12 +1,15 @@
 """The report's page in a real browser: nothing fails, nothing leaves it, nothing is cut, and its parts are linked."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from browser import CUT, SMALLEST
+from browser import CUT, NO_WEBGL, SMALLEST, is_readable_on_a_phone_and_on_paper
 from run_folder import LOST, PERIOD_NS, make_run
+from vislam.cli import run_verb
+from vislam.loop import loops_text, read_loops
 from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer import LabelLayer
@@ -36,7 +39,7 @@ def report(tmp_path_factory):
 class Opened:
     """A page that is ready, with what went wrong in it and what it asked of the network."""
 
-    def __init__(self, chromium, path, width=1400, scheme="light", javascript=True):
+    def __init__(self, chromium, path, width=1400, scheme="light", javascript=True, webgl=True):
         self.context = chromium.new_context(
             viewport={"width": width, "height": 900},
             color_scheme=scheme,
@@ -45,9 +48,14 @@ class Opened:
         )
         self.page = self.context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)
+        if not webgl:
+            self.page.add_init_script(NO_WEBGL)
         self.faults, self.requests = [], []
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
-        self.page.on("console", lambda said: said.type == "error" and self.faults.append(said.text))
+        known = "nothing" if webgl else "creating WebGL context"
+        self.page.on(
+            "console", lambda said: said.type == "error" and known not in said.text and self.faults.append(said.text)
+        )
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(path.resolve().as_uri())
         if javascript:
@@ -134,6 +142,54 @@ def test_a_loop_that_is_clicked_tells_its_reason(page):
     page.locator("#view-canvas").click(position={"x": at[0], "y": at[1]})
     page.wait_for_selector("#view-details .loop:not([hidden])")
     assert "verified, 3 neighbours agree" in page.locator("#view-details .loop").inner_text()
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_from_above_the_whole_path_is_seen(chromium, report, width):
+    with Opened(chromium, report, width) as page:
+        look_from_above(page)
+        places = np.array(page.evaluate(
+            "() => { const v = window.vislamReport.view, p = v.data.paths[v.data.best].xyz;"
+            "return Array.from({ length: p.length / 3 }, (_, k) => v.project(...p.subarray(3 * k, 3 * k + 3))); }"
+        ))  # fmt: skip
+        size = page.evaluate("(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(view_canvas)".replace(
+            "view_canvas", "document.getElementById('view-canvas')"))  # fmt: skip
+        assert (places > 0.0).all() and (places < size).all()
+        assert (np.ptp(places, axis=0) / size).max() > 0.75  # as large as it goes
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+def test_without_webgl_a_picture_and_a_word_stand_where_the_map_is(chromium, report, width):
+    with Opened(chromium, report, width, webgl=False) as page:
+        assert "no WebGL" in page.locator(".canvas .note").inner_text()
+        box = page.locator(".canvas svg").bounding_box()
+        assert box["height"] > 200 and box["y"] < 500
+        move_to(page, 0.5)
+        page.wait_for_function("() => Number(document.documentElement.dataset.time) > 20")  # the rest lives
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        assert page.evaluate(CUT) == []
+
+
+def test_loops_are_sorted_by_what_each_moved_and_by_any_column_that_is_clicked(chromium, tmp_path):
+    run = make_run(tmp_path / "sorted")
+    rows = read_loops(run / "loops.csv")
+    places = {id(row): k for k, row in enumerate(row for row in rows if row.decision == "accepted")}
+    rows = [replace(row, moved_max_m=0.01 * (7 * places[id(row)] % 12)) if id(row) in places else row for row in rows]
+    (run / "loops.csv").write_text(loops_text(rows))
+    with Opened(chromium, write_report(run)) as page:
+
+        def column(name):
+            heads = page.locator(".sortable table").first.locator("th").all_inner_texts()
+            cells = page.locator(f".sortable td:nth-child({heads.index(name) + 1})").all_text_contents()
+            assert len(cells) == 60
+            return cells
+
+        assert column("moved [m]")[:12] == [f"{0.01 * k:.3f}" for k in range(11, -1, -1)]
+        page.locator(".sortable th button", has_text="inliers").first.click()
+        inliers = [int(cell) for cell in column("inliers")]
+        assert inliers == sorted(inliers, reverse=True)
+        page.locator(".sortable th button", has_text="decision").first.click()
+        assert column("decision") == sorted(column("decision"))
 
 
 class Fingers:
@@ -233,6 +289,14 @@ def test_on_paper_the_pictures_stand_and_it_is_short(chromium, report):
         assert page.locator("section.still").first.is_visible()
         pages = page.pdf(format="A4").count(b"/Type /Page\n")
         assert 1 <= pages <= 4
+
+
+def test_pages_of_runs_and_of_graphs_are_readable_on_a_phone_and_on_paper(chromium, report, tmp_path):
+    graph = tmp_path / "graph.g2o"
+    assert run_verb(["simulate", "--graph", "manhattan", "--poses", "200", "--out", str(graph)]) == 0
+    assert run_verb(["posegraph", str(graph), "--out", str(tmp_path / "out")]) == 0
+    for path in (report, tmp_path / "out" / "report.html"):
+        is_readable_on_a_phone_and_on_paper(chromium, path)
 
 
 def test_labels_are_shown_by_class_and_each_can_be_turned_off(chromium, tmp_path):

@@ -1,7 +1,5 @@
 """A run that was ended, by whatever, goes on: what each stage remembers, and the whole pipeline under kill -9."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -254,6 +252,24 @@ def test_what_cannot_be_resumed_is_told_in_one_line(copied, spoil, code, message
     error = capsys.readouterr().err.strip()
     assert message in error
     assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "advice"),
+    [
+        (lambda out: None, "start one with --out {out}"),
+        (lambda out: out.mkdir(), "start one with --out {out}"),
+        (lambda out: (out.mkdir(), (out / "manifest.json").write_text("{}")), "start one with --out {out} --overwrite"),
+        (lambda out: (out.mkdir(), (out / "notes.txt").write_text("")), "start one with --out and a new folder"),
+        (lambda out: out.write_text(""), "start one with --out and a new folder"),
+    ],
+)
+def test_where_no_run_is_the_advice_works(tmp_path, make, advice, capsys):
+    out = tmp_path / "drive"
+    make(out)
+    assert run_verb(["run", "--resume", str(out)]) == 2
+    assert capsys.readouterr().err.strip().endswith(advice.format(out=out))
+    prepare(tmp_path / "new" if "new folder" in advice else out, overwrite="--overwrite" in advice)
 
 
 @pytest.mark.parametrize("left", ["nothing", "empty", "no keyframe"])

@@ -218,7 +218,9 @@ def test_without_rerun_or_when_off_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "vislam.runs.viewer.recording", raising=False)
     absent = open_viewer(tmp_path / "run.rrd")
     assert isinstance(absent, NullViewer)
-    assert ".[view]" in absent.reason
+    said = absent.close()
+    assert said is not None and "run.rrd is left out" in said and ".[view]" in said
+    assert absent.close() is None
     for viewer in (off, absent):
         with viewer:
             viewer.log_frame(frame(0), Observations(np.arange(1), np.zeros((1, 2))), Tracking.OK)

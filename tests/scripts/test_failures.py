@@ -1,7 +1,5 @@
 """A full disk, missing rights, absent boards and bad files: a short fixed part of `experiments/failures.py`."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys
@@ -51,8 +49,11 @@ def test_the_short_part_has_every_kind_of_failure() -> None:
 
 
 @pytest.mark.parametrize("case", SHORT, ids=lambda case: case.name)
-def test_what_fails_is_told_in_one_line_and_can_be_tried_again(case, data: Path, tmp_path: Path) -> None:
-    outcome = failures.run_case(case, data, tmp_path)
+def test_what_fails_is_told_in_one_line_and_can_be_tried_again(
+    case, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(data)
+    outcome = failures.run_case(case, data, tmp_path, lambda words: (run_verb(words), 0.0, capsys.readouterr().err))
     assert outcome.faults == (), outcome.said
 
 

@@ -1,7 +1,5 @@
 """The arithmetic of experiments/odometry_consistency.py, on motions whose errors and clocks are known."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from pathlib import Path

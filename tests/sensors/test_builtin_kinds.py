@@ -1,7 +1,5 @@
 """Every kind of sensor that is built in: derivatives, noise, and what it draws."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -143,9 +141,8 @@ def test_what_is_drawn_has_the_noise_that_the_sensor_says(name: str) -> None:
     own = own_of(sensor, rng, 0.0 if scaled else 0.02)
     body = a_driving_body(sensor, own, rng) if name in DRIVEN else a_body(rng)
     drawn = [sensor.draw(body, own, rng) for _ in range(4000)]
-    linear = [linearised(sensor, Reading("it", 0, values), body, own) for values in drawn]
-    residuals = np.array([one.residual for one in linear])
-    noise = np.mean([one.noise for one in linear], axis=0)
+    residuals = np.array([sensor.residual(values, body, own) for values in drawn])
+    noise = np.mean([sensor.noise(values) for values in drawn], axis=0)
     told = np.flatnonzero(residuals.std(axis=0) > 1e-9)  # not what a vehicle is believed not to do
     if name in DRIVEN:
         assert np.abs(np.delete(residuals, told, axis=1)).max() < 1e-9

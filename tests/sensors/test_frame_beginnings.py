@@ -1,7 +1,5 @@
 """Frames that sensors measure in are found from their first readings, and not before these tell them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

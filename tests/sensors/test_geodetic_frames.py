@@ -1,7 +1,5 @@
 """Latitude, longitude and height, and the local frame they are put into."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Latitude and longitude of a run's trajectories, and the line that a map program opens."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

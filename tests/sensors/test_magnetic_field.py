@@ -1,7 +1,5 @@
 """The machine's magnetometer as a sensor: it holds heading, is believed as far as it is right, and needs no wiring."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -49,7 +47,7 @@ def test_it_holds_heading_as_well_as_it_says(kind: str) -> None:
     for seed in range(RUNS):
         run = field_run(8000 + seed, 20.0, sensor)
         readings = run.readings
-        for with_field in (True, False):
+        for with_field in (True, False) if seed < 4 else (True,):  # a sigma hardly depends on the noise
             run.readings = readings if with_field else []
             k, ekf = list(run.replay(made(kind, Suite({"field": sensor}))))[-1]
             state = ekf.state()
@@ -60,7 +58,7 @@ def test_it_holds_heading_as_well_as_it_says(kind: str) -> None:
                 off = EARTH_UT - ekf.own("field")[0]
                 own.append(off @ np.linalg.solve(ekf.own_covariance("field"), off))
     low, high = chi2.ppf([0.0005, 0.9995], 3 * RUNS) / RUNS
-    ratio = np.mean(sigmas[True]) / np.mean(sigmas[False])
+    ratio = np.mean(sigmas[True][:4]) / np.mean(sigmas[False])
     print(f"{kind}: NEES {np.mean(nees):.2f} and {np.mean(own):.2f} of 3, {low:.2f} .. {high:.2f}; sigma x {ratio:.2f}")
     assert low < np.mean(nees) < high
     assert low < np.mean(own) < high

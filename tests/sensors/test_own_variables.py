@@ -1,7 +1,5 @@
 """Own variables are found from drawn readings along a known path, as surely as the sensor's noise says."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -87,7 +85,7 @@ def test_own_variables_are_found_as_surely_as_is_said(name: str) -> None:
     (sensor, frame), bodies = SENSORS[name], a_drive()
     starts, sigmas = (np.array([getattr(v, part) for v in sensor.variables]) for part in ("start", "sigma"))
     nees = []
-    for seed in range(8):
+    for seed in range(5):
         truth = starts + sigmas * np.random.default_rng(seed).normal(size=len(starts))
         truth[: len(frame)] = frame
         if "mounting" in name:  # a base that is turned in the body goes its own way straight ahead
@@ -103,7 +101,7 @@ def test_own_variables_are_found_as_surely_as_is_said(name: str) -> None:
 def test_noise_that_grows_with_what_is_told_makes_scales_wrong_by_little() -> None:
     """Readings that are too small by chance count as surer ones: a bias of twice the squared share."""
     sensor, bodies, off = Twist(TwistSettings(slip=0.02, turn_slip=0.05)), a_drive(), []
-    for seed in range(20):
+    for seed in range(8):
         own, _ = estimated(sensor, drawn_readings("it", sensor, bodies, np.ones(2), seed), bodies)
         off.append(own - 1.0)
     bias = np.abs(np.mean(off, axis=0))

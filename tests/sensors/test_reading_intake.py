@@ -1,7 +1,5 @@
 """Readings on their way to filter and graph: what waits, what begins a sensor, what goes with which keyframe."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 

@@ -35,8 +35,8 @@ PLACES = {
 }
 
 
-def a_world(seed: int, duration_s: float = 24.0) -> World:
-    return World(duration_s, seed=seed, vo_sigma_rad=np.deg2rad(0.5), vo_sigma_m=0.02)
+def a_world(seed: int, duration_s: float = 24.0, keyframe_hz: float = 5.0) -> World:
+    return World(duration_s, keyframe_hz, seed=seed, vo_sigma_rad=np.deg2rad(0.5), vo_sigma_m=0.02)
 
 
 def drawn_fix(rng: np.random.Generator) -> tuple[Array, OwnStart]:
@@ -117,7 +117,7 @@ def test_pose_and_own_variables_are_told_together(monkeypatch: pytest.MonkeyPatc
     watched, errors = WatchedSolvers(monkeypatch), []
     for seed in range(4):
         truth, start = drawn_fix(np.random.default_rng(seed))
-        drive = Drive(a_world(seed), {"fixes": Fixes(0.05)}, {"fixes": truth}, True, LOOSE).run((start,))
+        drive = Drive(a_world(seed, 24.0, 2.5), {"fixes": Fixes(0.05)}, {"fixes": truth}, True, LOOSE).run((start,))
         graph, own = drive.graph, told(drive.graph, "fixes")
         assert graph.joint_covariance(0, "nothing") is None
         with pytest.raises(IndexError, match=f"the graph has {len(drive.packets)}"):
@@ -143,7 +143,7 @@ def test_pose_and_own_variables_are_told_together(monkeypatch: pytest.MonkeyPatc
 def test_fixes_in_an_unknown_frame_bend_odometry_back_and_errors_are_as_told(kind: str, fake_window) -> None:
     poses, own, gain = [], [], []
     for seed in range(3):
-        world = a_world(seed)
+        world = a_world(seed, 24.0, 2.5)
         fake_window(world)
         truth, start = drawn_fix(np.random.default_rng(seed))
         config = TIGHT if kind == "tight" else LOOSE
@@ -166,7 +166,7 @@ def test_ranges_to_places_known_to_a_metre_find_them_and_the_body() -> None:
         sensors: dict[str, Sensor] = {name: Range(place) for name, place in PLACES.items()}
         own = {name: place + rng.normal(size=3) for name, place in PLACES.items()}
         starts = tuple(OwnStart(name, place, np.ones(3)) for name, place in PLACES.items())
-        drive = Drive(a_world(seed), sensors, own)
+        drive = Drive(a_world(seed, 24.0, 2.5), sensors, own)
         drive.run(starts).graph.finish()
         nees.append(drive.nees())
         gain.append(drive.error_m() / drive.odometry_m())
@@ -180,8 +180,8 @@ def test_body_speed_finds_its_scale_and_follows_an_offset_that_walks() -> None:
     nees = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        world, sensor = a_world(seed), Speed()
-        offsets = 0.1 * rng.normal() + np.cumsum(0.02 * np.sqrt(0.2) * rng.normal(size=world.count))
+        world, sensor = a_world(seed, 24.0, 2.5), Speed()
+        offsets = 0.1 * rng.normal() + np.cumsum(0.02 * np.sqrt(0.4) * rng.normal(size=world.count))
         scale = 1.0 + 0.1 * rng.normal()
         drive = Drive(world, {"speed": sensor}, {"speed": np.array([scale, offsets[-1]])})
         start = OwnStart("speed", np.array([1.0, 0.0]), np.array([0.1, 0.1]))

@@ -1,7 +1,5 @@
 """A session remembers what other sensors said, so that a graph is built again with the same factors."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -133,6 +131,7 @@ def without_readings(path: Path) -> None:
         db.execute("DROP TABLE own_starts")
         db.execute("DROP TABLE labels")
         db.execute("DROP TABLE motions")
+        db.execute("DROP TABLE further")
         db.execute("PRAGMA user_version=8")
 
 

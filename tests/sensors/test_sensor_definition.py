@@ -1,7 +1,5 @@
 """The body between keyframes, and sensors as linear systems."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

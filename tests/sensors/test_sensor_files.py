@@ -1,7 +1,5 @@
 """Files of sensors: tables, counts of encoders, and what satellite receivers write."""
 
-from __future__ import annotations
-
 import contextlib
 import pickle
 import struct

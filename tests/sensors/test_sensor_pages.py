@@ -1,7 +1,5 @@
 """What the pages about sensors show works, and no kind, column or setting is missing there."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import tomllib

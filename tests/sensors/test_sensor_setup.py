@@ -1,7 +1,5 @@
 """Sensors described by a TOML file, and kinds that somebody else brings."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path

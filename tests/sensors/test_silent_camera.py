@@ -1,7 +1,5 @@
 """A camera that gives no images for a minute: filter and graph go on by wheels and IMU."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from types import SimpleNamespace
@@ -81,7 +79,7 @@ def test_what_is_seen_after_a_minute_without_sight_is_judged_by_a_speed_that_is_
 
 @pytest.mark.slow
 def test_filter_and_graph_go_on_by_wheels_while_the_camera_is_silent() -> None:
-    silent_s = 60.0
+    silent_s = 30.0
     run = Silent(silent_s)
     graph = run.slam.back.graph
     states = graph.states()

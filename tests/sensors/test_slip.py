@@ -1,7 +1,5 @@
 """Wheels that slip: when that begins and ends, what nobody is told meanwhile, and what it costs filter and graph."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The world of a cart with one webcam and a GY-85: its way, its mounting, its late camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rendered worlds in which vision is spoilt: each option does what it says, when it says, and nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from faults.sensor_faults import BREAKS, FAULTS, FaultyRecording
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.messages import Frame, ImuSample
@@ -11,7 +12,6 @@ from vislam.core.streams import Happening, StreamJudge
 from vislam.core.trajectory import Trajectory
 from vislam.imu import ImuNoise
 from vislam.imu.series import AXES
-from vislam.sim.faults.faults import BREAKS, FAULTS, FaultyRecording
 
 LENGTH_S, FROM_S = 10.0, 4.02
 BEGIN_NS = 5_001_000_000 + round(FROM_S * 1e9)

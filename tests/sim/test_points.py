@@ -1,7 +1,5 @@
 """Simulated vision: what is projected agrees with the truth, every option does what it says, nothing is random."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Simulated vision rests on the motion of a real body: it must agree with the real IMU far better than its noise."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,6 @@ from vislam.sim.motion.motions import cart_laps, laps, straight, turn_in_place
 from vislam.trajectory import Trajectory
 from worlds.recordings import angles_rad, real
 
-RECORDINGS = {"v101": 40.0, "v201": 40.0}  # seconds that are looked at
 FX_PX = 458.0
 
 

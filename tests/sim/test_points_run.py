@@ -1,7 +1,5 @@
 """The whole pipeline on points: every mode, map and viewer on, and nothing minds that there are no images."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

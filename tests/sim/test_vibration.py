@@ -1,7 +1,5 @@
 """Vibration of one recording in the samples of another: only what is fast, at the other's rate, the same every time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

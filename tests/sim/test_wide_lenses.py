@@ -1,7 +1,5 @@
 """A run whose images are those of a double sphere, tracked as they are."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import vislam

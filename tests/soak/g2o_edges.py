@@ -1,7 +1,5 @@
 """Pose graph files as edges in key order, and their cost as their own residuals have it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

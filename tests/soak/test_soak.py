@@ -1,7 +1,5 @@
 """Runs as long as patience allows in every test run; the long ones are in benchmarks/long_run.py."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Files of trajectories as other tools write them: what they are taken for, and their numbers."""
 
+import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import pytest
 from evo.core import metrics, sync
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
+from test_trajectory import smooth
 
 from vislam.cli import run_verb
 from vislam.core import DataError
@@ -24,19 +27,9 @@ from vislam.trajectory import (
 )
 
 START_NS = 1_700_000_000_000_000_000
-
-
-def path_of(count: int = 100, period_ns: int = 50_000_000, start_ns: int = START_NS) -> Trajectory:
-    t = np.arange(count) * period_ns * 1e-9
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("ZY", np.stack([0.3 * t + 0.4, 0.2 * np.sin(t)], 1)).as_matrix()
-    poses[:, :3, 3] = np.stack([3 * np.cos(0.3 * t), 3 * np.sin(0.3 * t), 0.1 * t], 1)
-    return Trajectory(start_ns + np.arange(count) * period_ns, poses)
-
-
-PATH = path_of()
+PATH = Trajectory(START_NS + np.arange(100) * 50_000_000, smooth(100).T_world_body)
 ROWS = [
-    (int(t), *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())
+    (int(t), *T[:3, 3].tolist(), *Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
     for t, T in zip(PATH.t_ns, PATH.T_world_body, strict=True)
 ]
 
@@ -78,6 +71,13 @@ FORMS = {
         ),
         "by their names",
     ),
+    "whole seconds and the rest": (
+        text(
+            lambda *r: f"9.0,{r[0] // 10**9},{r[0] % 10**9}," + tum(*r, separator=",").partition(",")[2],
+            "Time,header.stamp.secs,header.stamp.nsecs,position.x,position.y,position.z,pose.qx,pose.qy,pose.qz,pose.qw\n",
+        ),
+        "by their names, seconds",
+    ),
     "rostopic": (
         text(
             lambda *r: f"{r[0]},3,{r[0]},odom," + tum(*r, separator=",").partition(",")[2],
@@ -116,7 +116,9 @@ def test_stamps_that_count_from_zero_are_nanoseconds_by_their_steps(tmp_path: Pa
     assert read_trajectory(path).t_ns.tolist() == (PATH.t_ns - START_NS).tolist()
 
 
-def test_kitti_takes_times_beside_it_or_given_and_two_without_are_paired_by_rows(tmp_path: Path, capsys) -> None:
+def test_kitti_takes_times_beside_it_or_given_and_two_without_are_paired_by_rows(
+    tmp_path: Path, capsys, monkeypatch
+) -> None:
     for name in ("a.txt", "b.txt"):
         write_kitti(PATH, tmp_path / name)
     asked = ["eval", str(tmp_path / "a.txt"), "--reference"]
@@ -130,8 +132,33 @@ def test_kitti_takes_times_beside_it_or_given_and_two_without_are_paired_by_rows
     times = tmp_path / "stamps.txt"
     times.write_text("".join(f"{t * 1e-9:.3f}\n" for t in PATH.t_ns))
     assert run_verb([*asked, str(tmp_path / "true.tum"), "--times", str(times)]) == 0
+    opened, open_ = [], os.open
+    monkeypatch.setattr(os, "open", lambda path, *rest, **named: opened.append(path) or open_(path, *rest, **named))
+    assert run_verb([*asked, str(tmp_path / "b.txt"), "--times", str(times)]) == 0
+    assert opened.count(tmp_path / "a.txt") == opened.count(tmp_path / "b.txt") > 0, "a reference is read once"
     times.rename(tmp_path / "times.txt")
     assert read_trajectory(tmp_path / "a.txt").t_ns[3] == PATH.t_ns[3]
+
+
+@pytest.mark.parametrize(
+    ("row", "names"),
+    [
+        (lambda *r: w_first_seconds(*r).replace(",", " "), "t tx ty tz qw qx qy qz"),
+        (lambda *r: tum(*r, unit="ns", separator=","), "t,tx,ty,tz,qx,qy,qz,qw"),
+    ],
+)
+def test_a_quaternion_with_w_at_the_other_end_is_refused_by_its_rotations(
+    row: Callable[..., str], names: str, tmp_path: Path, capsys
+) -> None:
+    odd, right = str(tmp_path / "odd"), str(tmp_path / "right")
+    write_tum(PATH, Path(right))
+    Path(odd).write_text(text(row))
+    for estimate, truth in ((odd, right), (right, odd)):
+        assert run_verb(["eval", estimate, "--reference", truth]) == 3
+        assert "its quaternion's w at the other end; name the columns" in capsys.readouterr().err
+    Path(odd).write_text(text(row, f"# {names}\n"))
+    assert run_verb(["eval", odd, "--reference", right, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["odd"]["rpe_1s_deg"] < 1e-3
 
 
 def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
@@ -174,6 +201,7 @@ def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
         (b"# time lat lon alt\n1 48 11 500\n", "latitude and longitude .* no metres; convert them"),
         (b"frame,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n", "no column is a time, the first is 'frame'; put the time"),
         (b"a,b,c\nd,e,f\n", "could not convert"),
+        (b"1403636579763555,1,2,3,0.1,0.2,0.3\n", "7 numbers whose last four are no quaternion"),
         (b"1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", "poses:2: NaN"),
         (b"1 nan nan nan nan nan nan nan\n", "only 1 rows of NaN"),
         (b"1 0 0 0 0 0 0 1\n2 0 0 0 0 0\n3 0 0 0 0 0 0 1", "poses:2: 6 columns, where the first row has 8"),
@@ -226,7 +254,7 @@ def test_states_of_openvins_are_read_by_their_names(names: str, tmp_path: Path) 
 @pytest.mark.parametrize("turn", ["", " 0 0 0 0", " 0 0 0 1", " 1 0 0 0", " nan nan nan nan"])
 def test_positions_only_give_no_rotation_and_no_relative_errors(turn: str, tmp_path: Path, capsys) -> None:
     path = tmp_path / "gps.txt"
-    path.write_text("".join(f"{t * 1e-9:.2f} {x!r} {y!r} {z!r}{turn}\n" for t, x, y, z, *_ in to_floats(ROWS)))
+    path.write_text("".join(f"{t * 1e-9:.2f} {x!r} {y!r} {z!r}{turn}\n" for t, x, y, z, *_ in ROWS))
     truth = read_trajectory(path)
     assert not truth.has_rotation
     entry = evaluate(PATH, truth)
@@ -241,17 +269,13 @@ def test_positions_only_give_no_rotation_and_no_relative_errors(turn: str, tmp_p
     assert run_verb(["eval", str(tmp_path / "estimate.tum"), "--reference", str(path), "--align", "first"]) == 2
 
 
-def to_floats(rows: list) -> list:
-    return [tuple(float(x) if k else x for k, x in enumerate(row)) for row in rows]
-
-
 def test_a_slow_truth_is_compared_next_to_its_own_poses() -> None:
     noise = np.random.default_rng(4).normal(0, 0.02, (600, 3))
-    fine = path_of(600, 100_000_000)
+    fine = smooth(600, period_ns=100_000_000)
     noisy = fine.T_world_body.copy()
     noisy[:, :3, 3] += noise
     estimate = Trajectory(fine.t_ns, noisy)
-    slow = path_of(60, 1_000_000_000)
+    slow = smooth(60, period_ns=1_000_000_000)
     entry = evaluate(estimate, slow)
     assert (entry["matched"], entry["total"], entry["coverage"]) == (60, 60, 1.0)
     assert entry["at"] == "reference"
@@ -267,7 +291,7 @@ def test_a_slow_truth_is_compared_next_to_its_own_poses() -> None:
 
 @pytest.mark.parametrize("period_s", [0.005, 1.0, 2.0, 60.0])
 def test_a_trajectory_covers_itself(period_s: float) -> None:
-    one = path_of(50, round(period_s * 1e9))
+    one = smooth(50, period_ns=round(period_s * 1e9))
     assert coverage(one, one) == 1.0
     holed = Trajectory(np.delete(one.t_ns, np.s_[10:40]), np.delete(one.T_world_body, np.s_[10:40], axis=0))
     assert coverage(holed, holed) == 1.0
@@ -279,7 +303,7 @@ def test_the_table_states_what_was_done_in_80_columns(tmp_path: Path, capsys, mo
     monkeypatch.setenv("COLUMNS", "80")
     names = [tmp_path / name for name in ("a_rather_long_name_of_a_camera_trajectory_that_somebody_chose.txt", "truth")]
     for path in names:
-        write_tum(path_of(20_000), path)
+        write_tum(smooth(20_000), path)
     assert run_verb(["eval", str(names[0]), "--reference", str(names[1])]) == 0
     out = capsys.readouterr().out
     assert "estimate: a_rather" in out and "TUM" in out

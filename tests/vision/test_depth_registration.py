@@ -1,7 +1,5 @@
 """Depth with a lens and a place of its own, in the colour camera's pixels: against what rays meet in the scene."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Corners, tracks, descriptors and matches."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

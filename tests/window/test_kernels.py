@@ -26,7 +26,7 @@ from vislam.window.spans import LinkStore
 from vislam.window.tracks import TrackTable
 from worlds.motion import EUROC_NOISE, Motion
 from worlds.parts import GRAVITY_M_S2, MACHINE
-from worlds.room import RGBD, STEREO, World, start_state, told_way
+from worlds.room import RGBD, STEREO, World, ring, start_state, told_way
 
 
 class Scene(NamedTuple):
@@ -62,12 +62,13 @@ def make_scene(rig, seed: int) -> Scene:
     links.hear(np.array(X), np.zeros(count, dtype=np.bool_))
     camera = Camera(
         T_body_cam=rig.T_body_cams[0],
-        T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams]),
+        T_cam0_cams=rig.T_cam0_cams,
         lenses=rig.lenses,
+        right=1 if rig.is_stereo else -1,
         rate=rng.normal(size=(count, 3)),
         applied_offset_s=rng.normal(size=count) * 1e-3,
         active=np.ones(CALIBRATION, dtype=np.bool_),
-        huber_k=np.full(3, 1.5),
+        huber_k=np.full(len(rig.cameras) + 1, 1.5),
         rho_information=0.01,
     )
     selection = tracks.select(np.arange(count))
@@ -95,7 +96,10 @@ def views_cost(scene: Scene, X: Array, points: Array, calibration: Array) -> flo
     return visual.cost(X, points, calibration, scene.views, scene.camera, squares)
 
 
-@pytest.mark.parametrize("rig", [STEREO, RGBD], ids=["stereo", "rgbd"])
+RIGS = {"stereo": STEREO, "rgbd": RGBD, "ring": ring(120.0, 240.0, pair=True)}
+
+
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
     scene = make_scene(rig, seed)
@@ -111,7 +115,7 @@ def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
                 retract(X[k], d)
                 costs.append(views_cost(scene, X, scene.points, scene.calibration))
             assert g[where[k, i]] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=1e-4, abs=1e-1)
-    for p in (0, len(scene.points) // 2):
+    for p in (0, len(scene.points) // 2, len(scene.points) - 1):
         for i in range(3):
             points = np.repeat(scene.points[None], 2, axis=0)
             points[0, p, i] += step
@@ -126,8 +130,9 @@ def test_gradient_of_views_is_that_of_their_cost(rig, seed: int) -> None:
         assert g[-CALIBRATION + i] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=1e-3, abs=1.0)
 
 
-def test_gradient_by_extrinsic_rotation() -> None:
-    scene = make_scene(STEREO, 3)
+@pytest.mark.parametrize("rig", [STEREO, ring(120.0)], ids=["stereo", "ring"])
+def test_gradient_by_extrinsic_rotation(rig) -> None:
+    scene = make_scene(rig, 3)
     scene.calibration[1:4] = 0.0  # where its tangent is its difference
     g, _ = normal_equations(scene)
     for i in range(1, 4):

@@ -1,7 +1,5 @@
 """Uniform motion of one camera: scale is forgotten, and the window says so; what the first turn then tells."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bags written by `rosbags` for tests, of any storage, from values or from the folders of other formats."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +14,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from worlds.mini_recording import BEGIN_NS, FRAME_NS, picture
+
 TF = "tf2_msgs/msg/TFMessage"
+K = np.array([[50.0, 0.0, 31.5], [0.0, 51.0, 23.5], [0.0, 0.0, 1.0]])
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
 KINDS = ("bag", "bag-bz2", "bag-lz4", "mcap", "mcap-zstd", "mcap-message", "db3", "db3-message")
@@ -153,6 +154,17 @@ def types_of(kind: str) -> Types:
     return Types(ros1=kind.startswith("bag"))
 
 
+def images_of(types: Types, images: Iterable[np.ndarray] | int = 3, **more: Any) -> list[Message]:
+    """One camera alone, calibrated by K for the size of its first image: pictures, or these images."""
+    images = [picture(i) for i in range(images)] if isinstance(images, int) else list(images)
+    size = images[0].shape[1::-1]
+    out = [Message(BEGIN_NS, "/cam0/camera_info", types.info(BEGIN_NS, size, K, "plumb_bob", [0.0] * 5))]
+    for i, image in enumerate(images):
+        t_ns = BEGIN_NS + i * FRAME_NS
+        out.append(Message(t_ns, "/cam0/image_raw", types.image(t_ns, image, "mono8", **more)))
+    return out
+
+
 def write_bag(folder: Path, kind: str, messages: Iterable[Message], name: str = "drive") -> Path:
     """Write messages in their order and return the bag's path."""
     base, _, packing = kind.partition("-")
@@ -194,8 +206,8 @@ def rows_of(path: Path) -> list[list[str]]:
 
 
 def from_asl(mav0: Path, types: Types, frames: int | None = None) -> Iterator[Message]:
-    """The messages of an ASL folder in time order: calibrations and places first, images as mono8 or bgr8."""
-    cameras = [name for name in ("cam0", "cam1") if (mav0 / name).is_dir()]
+    """The messages of an ASL folder in time order: calibrations and places first, images as mono8, mono16 or bgr8."""
+    cameras = sorted(folder.name for folder in mav0.glob("cam?"))
     images = [(int(t), name, mav0 / name / "data" / file.strip()) for name in cameras
               for t, file in rows_of(mav0 / name / "data.csv")[:frames]]  # fmt: skip
     last_ns = max(t for t, _, _ in images)
@@ -216,7 +228,7 @@ def from_asl(mav0: Path, types: Types, frames: int | None = None) -> Iterator[Me
         if is_image:
             name, path = value
             pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            encoding = "mono8" if pixels.ndim == 2 else "bgr8"
+            encoding = f"mono{8 * pixels.itemsize}" if pixels.ndim == 2 else "bgr8"
             yield Message(t_ns, f"/{name}/image_raw", types.image(t_ns, pixels, encoding, name))
         else:
             yield Message(t_ns, "/imu0", types.imu(t_ns, value))

@@ -1,7 +1,5 @@
 """Images of a board as a known camera sees it: every pixel's ray is met with the plane of the board."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

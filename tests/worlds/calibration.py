@@ -1,7 +1,5 @@
 """Recordings of sensors whose errors are known, for tests of calibration: written with plain code."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A corner of a room, drawn with exact truth: two walls and a floor, textured with smoothed noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """An endless run around the same lap, made keyframe by keyframe so that an hour needs no more memory than a minute."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A sliding window made of truth plus noise, for tests of what the graph does with one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

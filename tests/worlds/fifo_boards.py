@@ -1,7 +1,5 @@
 """A virtual board with a FIFO on a clock that takes no time, and what comes out of the real driver above it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vislam.config import BoardConfig
-from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.core.messages import Array, ImuSample
 from vislam.hw.emulator import EmulatedBus, FifoChip, SteppedClock, Truth, emulated_board, emulated_bus
 from vislam.hw.fifo_board import FifoBoard
 from worlds.gy85 import driving
@@ -58,25 +56,6 @@ class Stalled(SteppedClock):
 
 def inertial_chip(bus: EmulatedBus) -> FifoChip:
     return next(chip for chip in bus.chips.values() if isinstance(chip, FifoChip))
-
-
-def gathered(
-    driver: FifoBoard, clock: SteppedClock, duration_s: float, late_s: float = 0.0, seed: int = 3
-) -> tuple[list[ImuSample], list[MagSample]]:
-    """Read for so long by a host that is late by `late_s` in the mean before each call, 20 times that now and then."""
-    rng = np.random.default_rng(seed)
-    inertial: list[ImuSample] = []
-    magnetic: list[MagSample] = []
-    end_ns = clock.now_ns() + round(duration_s * 1e9)
-    while clock.now_ns() < end_ns:
-        if late_s:
-            late_ns = rng.exponential(late_s) * (20e9 if rng.random() < 0.02 else 1e9)
-            clock.advance(round(min(late_ns, 0.12e9)))
-        begin_ns = clock.now_ns()
-        for sample in driver.read(0.1):
-            (inertial if isinstance(sample, ImuSample) else magnetic).append(sample)  # type: ignore[arg-type]
-        assert clock.now_ns() - begin_ns < 0.35e9, "a read took longer than its timeout and the bus's limits"
-    return inertial, magnetic
 
 
 def stamp_errors_ms(driver: FifoBoard, bus: EmulatedBus, samples: list[ImuSample]) -> Array:

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import EkfConfig
+from vislam.core import Array, FurtherTracks, ImuSample, NavState, Observations, Tracking, VoMeasurement
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, so3_exp, transform
-from vislam.core.messages import Array, ImuSample, NavState, Observations, Tracking, VoMeasurement
 from vislam.ekf import MsckfEkf
 from vislam.imu import ImuNoise
 from worlds.motion import NS, T0_NS, Motion, state_error
 from worlds.parts import EUROC_CAMERA, MACHINE, R_BODY_CAM, along_x, on_walls, rig_of
+from worlds.room import Followed
 
 CHEAP = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3, 200.0)
 SIGMAS = np.repeat([0.02, 0.001, 0.05, 0.02, 0.1], 3)
@@ -22,7 +23,9 @@ CAMERA = replace(EUROC_CAMERA, distortion="radtan", coefficients=(-0.28, 0.07, 2
 # z of the camera looks along x of the body, a little turned
 R_BODY_TURNED = R_BODY_CAM @ so3_exp(np.array([0.05, -0.1, 0.02]))
 T_BODY_CAM = transform(R_BODY_TURNED, np.array([0.07, 0.03, -0.02]))
+REAR_TURN = transform(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.02, 0.03]))
 MONO, STEREO, RGBD = (rig_of(kind, CAMERA, T_BODY_CAM, along_x(0.11)) for kind in ("mono", "stereo", "rgbd"))
+REAR = Rig(MONO.cameras * 2, (T_BODY_CAM, REAR_TURN @ T_BODY_CAM))  # and a camera that looks back
 
 
 @dataclass
@@ -44,6 +47,7 @@ class Landmarks:
         self.points = on_walls(self.rng, self.count, self.half_m) + self.centre
         self._ids: NDArray[np.int64] = np.full(self.count, -1, dtype=np.int64)
         self._next = 0
+        self._further = {k: Followed(self.tracks, self.sigma_px, k, k << 40) for k in self.rig.further}
 
     def _project(self, T_world_body: Array, cam: int) -> Array:
         T = invert(T_world_body @ self.rig.T_body_cams[cam])
@@ -79,7 +83,12 @@ class Landmarks:
             z = (self.points[seen] @ T[:3, :3].T + T[:3, 3])[:, 2]
             rho = 1.0 / z + self.rng.normal(size=len(seen)) * self.depth_sigma_rho
             depth = np.where(z < 6.0, 1.0 / np.maximum(rho, 1e-2), np.nan)
-        return Observations(self._ids[seen].copy(), noisy, right, depth)
+        others = []
+        for k, followed in self._further.items():
+            theirs = self._project(pose_at(t_s), k)
+            theirs[~self.rig.cameras[k].contains(np.nan_to_num(theirs, nan=-1.0), 5.0)] = np.nan
+            others.append(FurtherTracks(k, *followed.see(theirs)))
+        return Observations(self._ids[seen].copy(), noisy, right, depth, further=tuple(others))
 
 
 def motion_of(t_ns: int, lost: bool = False) -> VoMeasurement:

@@ -1,7 +1,5 @@
 """A cart in a hall, drawn with exact truth: a textured floor and four walls, one camera that looks down a little."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache

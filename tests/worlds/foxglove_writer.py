@@ -1,7 +1,5 @@
 """MCAP files with messages in Foxglove's schemas, in plain code that shares nothing with the package."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct
@@ -49,6 +47,10 @@ SCHEMAS: dict[str, list[tuple[str, int, int | str, bool]]] = {
     ],
     "foxglove.PoseInFrame": [
         ("timestamp", 1, TIME, False), ("frame_id", 2, STRING, False), ("pose", 3, ".foxglove.Pose", False),
+    ],
+    "foxglove.CompressedVideo": [
+        ("timestamp", 1, TIME, False), ("frame_id", 2, STRING, False), ("data", 3, BYTES, False),
+        ("format", 4, STRING, False),
     ],
 }  # fmt: skip
 
@@ -217,16 +219,17 @@ def of_ros(message: Message) -> tuple[str | None, dict[str, Any]]:
     value, kind = message.value, message.type.rsplit("/", 1)[-1]
     if kind == "TFMessage":
         return "foxglove.FrameTransforms", {"transforms": [_transform(one) for one in value.transforms]}
-    if kind not in ("Image", "CompressedImage", "CameraInfo", "NavSatFix", "PoseStamped"):
+    if kind not in ("Image", "CompressedImage", "CameraInfo", "NavSatFix", "PoseStamped", "CompressedVideo"):
         return None, {}
-    stamp = value.header.stamp
+    is_video = kind == "CompressedVideo"
+    stamp = value.timestamp if is_video else value.header.stamp
     values: dict[str, Any] = {
         "timestamp": {"seconds": stamp.sec, "nanos": stamp.nanosec},
-        "frame_id": value.header.frame_id,
+        "frame_id": value.frame_id if is_video else value.header.frame_id,
     }
-    if kind in ("Image", "CompressedImage"):
+    if kind in ("Image", "CompressedImage", "CompressedVideo"):
         names = ("width", "height", "encoding", "step") if kind == "Image" else ("format",)
-        schema = "foxglove.RawImage" if kind == "Image" else "foxglove.CompressedImage"
+        schema = "foxglove.RawImage" if kind == "Image" else f"foxglove.{kind}"
         return schema, values | {n: getattr(value, n) for n in names} | {"data": value.data.tobytes()}
     if kind == "CameraInfo":
         matrices = {n.upper(): np.asarray(getattr(value, n)).ravel().tolist() for n in "dkrp"}

@@ -1,7 +1,5 @@
 """A GoPro's MP4 written by hand from gpmf-parser's description: a real video track, and a track `gpmd` of GPMF."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from pathlib import Path

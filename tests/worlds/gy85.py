@@ -1,7 +1,5 @@
 """A virtual board on a clock that takes no time, and what comes out of the real driver above it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +12,7 @@ from vislam.config import Gy85Config
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.emulator import EmulatedBus, SteppedClock, Truth, emulated_bus, emulated_gy85
 from vislam.hw.gy85 import Gy85
+from vislam.hw.source import InertialSource
 
 FIELD_UT = np.array([20.0, -5.0, -42.0])
 
@@ -46,18 +45,24 @@ def board(
             driver.close()
 
 
-def collect(driver: Gy85, clock: SteppedClock, duration_s: float) -> tuple[list[ImuSample], list[MagSample]]:
-    """Read for so long, in calls of 0.1 s at most; every call must return in time."""
+def collect(
+    driver: InertialSource, clock: SteppedClock, duration_s: float, late_s: float = 0.0, seed: int = 3
+) -> tuple[list[ImuSample], list[MagSample]]:
+    """Read for so long, in calls of 0.1 s at most, of which every one must return in time.
+
+    The host is late by `late_s` in the mean before each call, 20 times that now and then.
+    """
+    rng = np.random.default_rng(seed)
     inertial: list[ImuSample] = []
     magnetic: list[MagSample] = []
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while clock.now_ns() < end_ns:
+        if late_s:
+            late_ns = rng.exponential(late_s) * (20e9 if rng.random() < 0.02 else 1e9)
+            clock.advance(round(min(late_ns, 0.12e9)))
         begin_ns = clock.now_ns()
         for sample in driver.read(0.1):
-            if isinstance(sample, ImuSample):
-                inertial.append(sample)
-            else:
-                magnetic.append(sample)
+            (inertial if isinstance(sample, ImuSample) else magnetic).append(sample)  # type: ignore[arg-type]
         assert clock.now_ns() - begin_ns < 0.35e9, "a read took longer than its timeout and the bus's limits"
     return inertial, magnetic
 

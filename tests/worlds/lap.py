@@ -1,7 +1,5 @@
 """A small exact world for the graph's tests: analytic periodic motion, noisy IMU, visual odometry and loop edges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -18,10 +18,14 @@ def picture(seed: int, size: tuple[int, int] = (WIDTH, HEIGHT), color: bool = Fa
     return cv2.GaussianBlur(np.random.default_rng(seed).integers(0, 255, shape, dtype=np.uint8), (5, 5), 1.0)
 
 
-def camera_yaml(x_m: float = 0.0, extra: str = "", size: tuple[int, int] = (WIDTH, HEIGHT)) -> str:
+def camera_yaml(
+    x_m: float = 0.0, extra: str = "", size: tuple[int, int] = (WIDTH, HEIGHT), is_rear: bool = False
+) -> str:
     T = np.eye(4)
     T[:3, :3] = R_BODY_CAM
     T[:3, 3] = R_BODY_CAM @ [x_m, 0.0, 0.0]
+    if is_rear:
+        T[:2] *= -1.0
     return (
         f"sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: {T.ravel().tolist()}\nrate_hz: 20\n"
         f"resolution: [{size[0]}, {size[1]}]\ncamera_model: pinhole\nintrinsics: [50.0, 51.0, 31.5, 23.5]\n"
@@ -35,10 +39,12 @@ IMU_YAML = (
 )
 
 
-def write_camera(root: Path, name: str, count: int, x_m: float = 0.0, color: bool = False, seed: int = 0) -> None:
+def write_camera(
+    root: Path, name: str, count: int, x_m: float = 0.0, color: bool = False, seed: int = 0, is_rear: bool = False
+) -> None:
     folder = root / name
     (folder / "data").mkdir(parents=True)
-    (folder / "sensor.yaml").write_text(camera_yaml(x_m))
+    (folder / "sensor.yaml").write_text(camera_yaml(x_m, is_rear=is_rear))
     rows = ["#timestamp [ns],filename"]
     for i in range(count):
         t_ns = BEGIN_NS + i * FRAME_NS
@@ -58,12 +64,17 @@ def write_imu(root: Path, rows: list[str]) -> None:
     (root / "imu0" / "data.csv").write_text("\n".join(["#timestamp [ns],wx,wy,wz,ax,ay,az", *rows]) + "\n")
 
 
-def write_asl(folder: Path, frames: int = 6, stereo: bool = True, color: bool = False) -> Path:
-    """A recording of `frames` frames at 20 Hz with an IMU of 200 Hz over the same time; returns its mav0."""
+def write_asl(folder: Path, frames: int = 6, stereo: bool = True, color: bool = False, rear: bool = False) -> Path:
+    """A recording of `frames` frames at 20 Hz with an IMU of 200 Hz over the same time; returns its mav0.
+
+    With `rear` there is a camera that looks back.
+    """
     root = folder / "mav0"
     write_camera(root, "cam0", frames, color=color)
     if stereo:
         write_camera(root, "cam1", frames, x_m=0.1, seed=100)
+    if rear:
+        write_camera(root, "cam2" if stereo else "cam1", frames, seed=200, is_rear=True)
     write_imu(root, imu_rows((frames - 1) * (FRAME_NS // IMU_NS) + 1))
     return root
 

@@ -5,8 +5,6 @@ every deviation from the chi-square band is the filter's. The errors of vision t
 they arise, in its landmarks: they displace the keyframe.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """What several worlds are made of: mounted cameras, points on walls, textures, keyframes without images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

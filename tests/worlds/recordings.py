@@ -1,7 +1,5 @@
 """Real recordings whose inertial data and truth carry simulated vision, cut short so that tests stay fast."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,14 +1,12 @@
 """Random landmarks around an exact motion, seen by a pinhole rig: keyframe packets without images, for tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
+from vislam.core import Array, FurtherTracks, KeyframePacket, NavState, Observations, Tracking, VoMeasurement
 from vislam.core.camera import EXACT, Camera, Rig
 from vislam.core.geometry import invert, skew, so3_exp, transform
-from vislam.core.messages import Array, KeyframePacket, NavState, Observations, Tracking, VoMeasurement
 from vislam.core.readings import Motion as Told
 from vislam.imu import ImuNoise
 from vislam.imu.series import ImuSeries
@@ -21,6 +19,18 @@ T_BODY_CAM1 = transform(R_BODY_CAM, np.array([0.05, -0.06, 0.02]))
 MONO = Rig((PINHOLE,), (T_BODY_CAM0,))
 STEREO = Rig((PINHOLE, PINHOLE), (T_BODY_CAM0, T_BODY_CAM1))
 RGBD = Rig((PINHOLE,), (T_BODY_CAM0,), has_depth=True)
+
+
+def ring(*others_deg: float, pair: bool = False) -> Rig:
+    """Return the first camera, the pair if asked for, and others turned about the vertical, 12 cm from the middle."""
+    further = []
+    for angle in np.deg2rad(others_deg):
+        turn = so3_exp(np.array([0.0, 0.0, angle]))
+        further.append(transform(turn @ R_BODY_CAM, turn @ np.array([0.12, 0.01, 0.03])))
+    first = STEREO.T_body_cams[: 2 if pair else 1]
+    return Rig((PINHOLE,) * (len(first) + len(further)), (*first, *further))
+
+
 GYRO_BIAS, ACCEL_BIAS = np.array([0.006, -0.004, 0.008]), np.array([0.08, -0.05, 0.06])
 
 
@@ -66,8 +76,8 @@ class World:
         next_id, packets, truths, t_before = 0, [], [], None
         correction = np.eye(3) if self.R_cam_correction is None else so3_exp(self.R_cam_correction)
         T_cams = [T_BODY_CAM0 @ transform(correction, np.zeros(3))]
-        if self.rig.is_stereo:
-            T_cams.append(T_cams[0] @ self.rig.T_cam0_cam1)
+        T_cams += [T_cams[0] @ T for T in self.rig.T_cam0_cams[1:]]
+        further = {k: Followed(self.tracks, self.sigma_px, self.seed + k, k << 40) for k in self.rig.further}
         for k in range(int(self.duration_s * self.keyframe_hz)):
             t_s = 0.1 + k / self.keyframe_hz
             t_ns = T0_NS + round(t_s * NS)
@@ -91,7 +101,8 @@ class World:
                 depth_m = 1.0 / (1.0 / depth[chosen] + rng.normal(size=len(chosen)) * self.depth_sigma_rho)
             T, v, _, _ = self.motion.at(t_s)
             imu = None if t_before is None else series.cut(t_before, t_ns)
-            seen = Observations(ids[chosen].copy(), noisy, right, depth_m)
+            others = tuple(FurtherTracks(c, *followed.see(views[c][0])) for c, followed in further.items())
+            seen = Observations(ids[chosen].copy(), noisy, right, depth_m, further=others)
             packets.append(packet(k, t_ns, seen, imu, at_rest=k > 0 and t_s <= self.rest_until_s))
             truths.append((T, v, biases[min(round(t_s * self.noise.rate_hz), len(biases) - 1)]))
             t_before = t_ns
@@ -111,6 +122,26 @@ class World:
                     pixels[i] = PINHOLE.project(p[i : i + 1])[0]
             pixels[~PINHOLE.contains(pixels)] = np.nan
         return pixels, p[:, 2]
+
+
+class Followed:
+    """Tracks of a further camera: landmarks that it goes on seeing, and new ones for those that it lost."""
+
+    def __init__(self, count: int, sigma_px: float, seed: int, first_id: int) -> None:
+        self._count, self._sigma_px, self._next_id = count, sigma_px, first_id
+        self._rng = np.random.default_rng(seed)
+        self._id_of: dict[int, int] = {}  # by landmark
+
+    def see(self, pixels: Array) -> tuple[Array, Array]:
+        """Return ids [N] and noisy pixels [N, 2] of tracks, of all landmarks' pixels, NaN where out of sight."""
+        visible = np.flatnonzero(np.isfinite(pixels[:, 0]))
+        self._id_of = {i: self._id_of[i] for i in visible.tolist() if i in self._id_of}
+        for i in self._rng.permutation(visible).tolist():
+            if len(self._id_of) < self._count and i not in self._id_of:
+                self._id_of[i], self._next_id = self._next_id, self._next_id + 1
+        landmarks = np.array(list(self._id_of), dtype=np.int64)
+        noise = self._rng.normal(size=(len(landmarks), 2)) * self._sigma_px
+        return np.array(list(self._id_of.values()), dtype=np.int64), pixels[landmarks] + noise
 
 
 def packet(k: int, t_ns: int, seen: Observations, imu, at_rest: bool = False) -> KeyframePacket:

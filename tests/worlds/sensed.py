@@ -1,12 +1,10 @@
 """Sensors beside camera and IMU in the world of `lap`: their readings, placed between keyframes, with exact truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
-from vislam.core.geometry import invert, so3_exp, so3_log, transform
+from vislam.core.geometry import invert, so3_exp, so3_log
 from vislam.core.messages import Array, KeyframePacket
 from vislam.core.readings import OwnStart, PlacedReading, Reading, Station
 from vislam.sensors import BodyState, Sensor, Variable
@@ -31,6 +29,13 @@ class Fixes(Sensor):
     def residual(self, values: Array, body: BodyState, own: Array) -> Array:
         antenna = body.position_m + body.R_world_body @ own[:3]
         return values - so3_exp(np.array([0.0, 0.0, own[3]])) @ antenna - own[4:]
+
+    def jacobians(self, values: Array, body: BodyState, own: Array) -> tuple[Array, Array]:
+        Rz, R = so3_exp(np.array([0.0, 0.0, own[3]])), body.R_world_body
+        x, y, _ = Rz @ (body.position_m + R @ own[:3])
+        H, heading = np.zeros((3, 15)), np.array([[-y], [x], [0.0]])
+        H[:, :3], H[:, 3:6] = Rz @ R @ np.cross(own[:3], np.eye(3)), Rz
+        return H, np.hstack([Rz @ R, heading, np.eye(3)])
 
     def noise(self, values: Array) -> Array:
         return np.eye(3) * self.sigma_m**2
@@ -128,11 +133,6 @@ def reading_at(
 def with_readings(packet: KeyframePacket, *readings: PlacedReading, starts: tuple[OwnStart, ...] = ()):
     """Return a packet with readings, and the first values of own variables."""
     return replace(packet, readings=(*packet.readings, *readings), own_starts=(*packet.own_starts, *starts))
-
-
-def yaw_transform(yaw_rad: float, origin_m: Array) -> Array:
-    """Return a motion [4, 4] of that heading."""
-    return transform(so3_exp(np.array([0.0, 0.0, yaw_rad])), origin_m)
 
 
 def pose_error(T_true: Array, T: Array) -> Array:

@@ -1,7 +1,5 @@
 """Short simulated runs with further sensors, each made once, for tests of what a run makes of them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

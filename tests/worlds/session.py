@@ -1,7 +1,5 @@
 """Runs of a simulated world as factor logs: exact motion, landmarks seen with noise, outliers, true and false loops."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal

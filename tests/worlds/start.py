@@ -1,7 +1,5 @@
 """Random starts of one camera with an IMU among points: exact truth, pixel noise, wrong tracks, visual rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

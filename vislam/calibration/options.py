@@ -1,7 +1,5 @@
 """The options of every kind of `vislam calibrate`; their comments and docstrings are its --help."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -31,15 +29,10 @@ class BoardOptions:
     """Of the markers: OpenCV's DICT_..., such as 4X4_50, 5X5_100, 6X6_250, APRILTAG_36h11"""
 
 
-@dataclass(frozen=True)
-class BoardFile:
-    """Options of `vislam calibrate board`."""
+@dataclass(frozen=True, kw_only=True)
+class ToFolder:
+    """What every calibration that writes files is asked for."""
 
-    board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
-    paper: Literal["a4", "a3", "a2", "letter"] | None = None
-    """Paper, lying; None: the smallest that holds the board"""
-    out: Path = Path("calibration")
-    """Folder for board.png, board.pdf and board.json"""
     overwrite: bool = False
     """Replace what an earlier calibration wrote"""
     json: bool = False
@@ -47,7 +40,18 @@ class BoardFile:
 
 
 @dataclass(frozen=True)
-class CameraOptions:
+class BoardFile(ToFolder):
+    """Options of `vislam calibrate board`."""
+
+    board: Annotated[BoardOptions, tyro.conf.arg(name="")] = field(default_factory=BoardOptions)
+    paper: Literal["a4", "a3", "a2", "letter"] | None = None
+    """Paper, lying; None: the smallest that holds the board"""
+    out: Path = Path("calibration")
+    """Folder for board.png, board.pdf and board.json"""
+
+
+@dataclass(frozen=True)
+class CameraOptions(ToFolder):
     """Options of `vislam calibrate camera`."""
 
     source: Positional[str]
@@ -67,14 +71,10 @@ class CameraOptions:
     """How long a live camera is looked at; move the board slowly, hold it still now and then"""
     out: Path = Path("calibration")
     """Folder for camchain.yaml (Kalibr), camera.yaml (ASL), camera_info.yaml (ROS), camera.png and camera.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class NoiseOptions:
+class NoiseOptions(ToFolder):
     """Options of `vislam calibrate noise`."""
 
     source: Positional[Path]
@@ -83,14 +83,10 @@ class NoiseOptions:
     """Folder for noise.yaml, noise.png and noise.json"""
     driving: Path | None = None
     """Recording of a usual drive: white noise is raised to what its quietest half second shows"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class FloorOptions:
+class FloorOptions(ToFolder):
     """Options of `vislam calibrate floor`."""
 
     source: Positional[str]
@@ -109,14 +105,10 @@ class FloorOptions:
     """Take so much of it; None: all"""
     out: Path = Path("calibration")
     """Folder for floor.toml, floor.png and floor.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class ImuOptions:
+class ImuOptions(ToFolder):
     """Options of `vislam calibrate imu`."""
 
     source: Positional[Path]
@@ -129,14 +121,10 @@ class ImuOptions:
     """A pose counts when it was held so long"""
     gravity_m_s2: Annotated[float, Range(0.1, 100.0)] = 9.81
     """Where it was recorded: 9.780 at the equator to 9.832 at the poles; as machine.gravity_m_s2 of the config"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class CameraImuOptions:
+class CameraImuOptions(ToFolder):
     """Options of `vislam calibrate camera-imu`."""
 
     source: Positional[str]
@@ -146,14 +134,10 @@ class CameraImuOptions:
     """Seconds from the beginning that are used"""
     out: Path = Path("calibration")
     """Folder for camera-imu.yaml (Kalibr's camchain), camera-imu.png and camera-imu.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class MagOptions:
+class MagOptions(ToFolder):
     """Options of `vislam calibrate mag`."""
 
     source: Positional[Path]
@@ -164,28 +148,20 @@ class MagOptions:
     """imu.yaml of `vislam calibrate imu`, for gravity and turns; None: the recording's own"""
     out: Path = Path("calibration")
     """Folder for mag.yaml, mag.png and mag.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class RgbdOptions:
+class RgbdOptions(ToFolder):
     """Options of `vislam calibrate rgbd`."""
 
     source: Positional[str]
     """Recording with depth, as for `vislam run`: turned to all sides, before things that stand one behind the other"""
     out: Path = Path("calibration")
     """Folder for sensor.yaml (ASL, with our keys of depth), rgbd.png and rgbd.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class SelfOptions:
+class SelfOptions(ToFolder):
     """Options of `vislam calibrate self`."""
 
     source: Positional[str]
@@ -201,21 +177,13 @@ class SelfOptions:
     """Stretches of some 20 keyframes, spread over the recording; more cost time and memory"""
     out: Path = Path("calibration")
     """Folder for camchain.yaml (Kalibr), self.png and self.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""
 
 
 @dataclass(frozen=True)
-class SensorsOptions:
+class SensorsOptions(ToFolder):
     """Options of `vislam calibrate sensors`."""
 
     run: Positional[Path]
     """Finished run with further sensors (--sensors.file): a drive with turns both ways, loops or fixes"""
     out: Path = Path("calibration")
     """Folder for sensors.toml and sensors.json"""
-    overwrite: bool = False
-    """Replace what an earlier calibration wrote"""
-    json: bool = False
-    """Print JSON instead of lines"""

@@ -1,7 +1,5 @@
 """What every kind of calibration ends with: a file that the config takes, a picture, and what is known how well."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass

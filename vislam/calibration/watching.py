@@ -1,7 +1,5 @@
 """Calibration step by step: what a person sees while the sensor is moved, before anything is computed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol

@@ -3,8 +3,6 @@
 Exit codes: 0 done, 2 usage, 3 input or data, 4 tracking lost or a quality gate failed, 5 hardware, 130 interrupted.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

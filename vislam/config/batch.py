@@ -12,7 +12,6 @@ class BatchConfig:
 
     rounds: Count = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
     huber_k: Positive = 2.0  # standard deviations, in later rounds
-    max_observations: Many = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
     vision_inflation: Positive = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
     covariances: bool = True  # of all states; costs about as much as a round
 
@@ -24,7 +23,6 @@ class PoseGraphConfig:
     start: Literal["auto", "file", "odometry", "tree", "chordal", "angles", "grown"] = (
         "auto"  # auto: the one of lowest cost; all of them where it ends above what noise allows
     )
-    method: Literal["lm", "dogleg", "gtsam", "isam2"] = "lm"
     equations: Literal["auto", "cholesky", "gradients"] = "auto"  # conjugate gradients where a factor would be large
     # which edges that do not join successive ids may be rejected, by what; auto tries several, judges, and says why
     robust: Literal["none", "auto", "cauchy", "geman-mcclure", "dcs", "gnc"] = "none"

@@ -11,16 +11,13 @@ class EkfConfig:
     """The fast path."""
 
     # loose: motions of visual odometry; tight: the tracks themselves (MSCKF), ten times the time; auto: tight for one
-    # camera, whose motions lack scale, loose with stereo or depth
+    # camera, whose motions lack scale, and where there are cameras beyond the first pair, else loose
     coupling: Literal["auto", "loose", "tight"] = "auto"
     # accumulated: vision's own sum of motions, taken as a pose; none: inertial data alone from the first state on, for
     # comparison
     vision: Literal["relative", "accumulated", "none"] = "relative"
     odom: Literal["continuous", "corrected"] = "continuous"  # corrected: 3-30 % less error, 5 cm steps at a first turn
     history_s: Positive = 5.0  # how late a measurement may come; vision latency is under 0.3 s, a stalled reader longer
-    # what the rate may have been inside a hole longer than machine.max_gap_s, against its interpolation
-    gap_gyro_rad_s: NonNegative = 0.5
-    gap_accel_m_s2: NonNegative = 2.0  # the same for specific force
     # on sigmas of vision's motion, which miss model errors; over a floor frontend.planar's
     vo_inflation: Positive = 1.5
     vo_shared_fraction: Share = 0.5  # of its variance that all motions relative to one keyframe share (its landmarks)
@@ -38,10 +35,9 @@ class EkfConfig:
     tight_max_tracks: Count = 60  # used per frame; bounds its time
     # of a corner followed over many frames; more where tracks scatter by over 0.4 px
     tight_pixel_sigma_px: Positive = 1.0
-    tight_time_offset: bool = True  # estimate what is to be added to the stamps of frames
-    tight_time_offset_sigma_s: NonNegative = 0.01  # prior; USB cameras are stamped up to 30 ms late
-    tight_extrinsic_rotation: bool = True  # refine the camera's rotation in the body
-    tight_extrinsic_sigma_deg: NonNegative = 0.5  # prior; a calibration 1 deg off is two sigmas
+    # priors; at 0 the stated value stays
+    tight_time_offset_sigma_s: NonNegative = 0.01  # of what frames' stamps lack; USB cameras stamp up to 30 ms late
+    tight_extrinsic_sigma_deg: NonNegative = 0.5  # of the camera's rotation; a calibration 1 deg off is two sigmas
     # rolling shutter, first to last row; None: frontend.readout_s, else global
     tight_readout_s: NonNegative | None = None
     tight_history_s: Positive = 2.0  # how late a measurement may come; a state is 100 to 250 kB, one per frame
@@ -60,13 +56,10 @@ class WindowConfig:
     huber_k: Positive = 2.0  # of a reprojection error, in standard deviations
     rho_sigma_1_m: Positive = 10.0  # prior of inverse depth: only keeps points without parallax from running away
 
-    estimate_time_offset: bool = True  # of the camera against the IMU
-    time_offset_sigma_s: NonNegative = 0.02  # prior; cheap cameras stamp up to 30 ms late
-    estimate_rotation: bool = True  # of the camera on the body
-    rotation_sigma_deg: NonNegative = 0.5  # prior; a calibration by Kalibr is good to 0.1, a printed mount to 1
-    estimate_readout: bool = False  # of a rolling shutter; needs brisk rotation
+    # priors; at 0 the stated value stays
+    time_offset_sigma_s: NonNegative = 0.02  # of the camera against the IMU; cheap cameras stamp up to 30 ms late
+    rotation_sigma_deg: NonNegative = 0.5  # of the camera; a calibration by Kalibr is good to 0.1, a printed mount to 1
     readout_s: NonNegative | None = None  # rolling shutter, first to last row; None: frontend.readout_s, else global
-    readout_sigma_s: NonNegative = 0.01  # prior, when it is estimated
 
 
 @dataclass(frozen=True, slots=True)

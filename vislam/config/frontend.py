@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
-from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Share, Whole
+from vislam.config.ranges import Count, Finite, NonNegative, Positive, Range, Whole
 from vislam.core.kinds import check_name
 
 _OwnMode = Literal["auto", "mono", "stereo", "rgbd", "planar", "none"]
@@ -78,7 +78,6 @@ class FrontEndConfig:
     astray_px: NonNegative = 6.0  # from where a filter that knows its motion expects a track: it belongs to what moves
 
     keyframe_parallax_px: NonNegative = 40.0  # median with rotation taken out
-    keyframe_min_alive_unfit: Share = 0.2  # the same for a frame without depth, which makes a poor keyframe
     keyframe_min_inliers: Whole = 60  # fewer: new corners are worth the drift
     keyframe_min_interval_s: NonNegative = 0.15  # brisk motion: at most about six keyframes a second
     keyframe_max_interval_s: NonNegative = 2.0  # a camera at rest still reports

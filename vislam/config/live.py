@@ -12,6 +12,7 @@ class LiveConfig:
 
     name: str = "vislam-pose"  # of the shared memory, /dev/shm/NAME, and of the socket NAME.sock
     send_to: tuple[str, ...] = ("unix",)  # a datagram per sample to: unix[:PATH], udp:HOST:PORT
+    group: str | None = None  # its members may read the shared memory, too: a controller of another user's
     allow_remote: bool = False  # let send_to, mavlink and ROS 2 reach other machines
     ros2_domain: Annotated[int, Range(0, 232)] | None = None  # /odom and /tf over DDS, in this domain; needs cyclonedds
     mavlink: str | None = None  # udp:HOST:PORT that gets ODOMETRY; needs pymavlink

@@ -24,7 +24,7 @@ class DriveConfig:
     """Where the cart can stand and drive, from the octree."""
 
     body_length_m: Annotated[float, Range(0.01, 50.0)] = 0.60  # of the cart, whose middle is the body's origin
-    body_width_m: Annotated[float, Range(0.01, 50.0)] = 0.50
+    body_width_m: Annotated[float, Range(0.01, 50.0)] = 0.50  # of the cart
     # between neighbouring cells; less than a voxel is taken for one, which is what is seen
     max_step_m: NonNegative = 0.05
     max_slope_deg: NonNegative = 10.0  # what a cart with small wheels and a load brakes on

@@ -1,7 +1,5 @@
 """Names that settings had in earlier versions: users' files and the settings recorded with runs are read with them."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Named sets of settings for kinds of machines; a settings file and options go before them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

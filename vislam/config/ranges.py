@@ -3,8 +3,6 @@
 `sigma_px: Positive = 1.0` is a float for whoever uses it, and a wish outside of its range a usage error.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator

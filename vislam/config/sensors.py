@@ -101,42 +101,34 @@ class SerialConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class WebcamConfig:
-    """A webcam on V4L2; docs/sensors.md. What a camera does not do as asked is reported, not hidden."""
+class LibraryCameraConfig:
+    """What all cameras have in common; docs/sensors.md."""
 
-    device: str = "0"  # index, or a path below /dev/v4l/by-id, which stays the same when other cameras come and go
-    width_px: Count = 640  # enough for 400 tracks; 1280 costs four times the work of the front end
+    device: str = ""  # a serial number, an id; empty: the first that is found
+    width_px: Count = 640  # enough for 400 tracks; or the nearest size that the camera has: it is told
     height_px: Count = 480
     rate_hz: Positive = 30.0
-    fourcc: str = "MJPG"  # uncompressed video of more than 640x480 at 30 Hz does not fit through USB 2
     # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera, and lights flicker then
     exposure_s: NonNegative | None = 0.01
-    gain: NonNegative | None = None  # in units of the camera; None leaves it as it is
+    gain: NonNegative | None = None  # in units of the camera; None: its own
+    missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
+    start_s: NonNegative = 10.0  # until the first image; a device that loads its firmware takes some seconds
+    reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there
+
+
+@dataclass(frozen=True, slots=True)
+class WebcamConfig(LibraryCameraConfig):
+    """A webcam on V4L2. What a camera does not do as asked is reported, not hidden."""
+
+    device: str = "0"  # index, or a path below /dev/v4l/by-id, which stays the same when other cameras come and go
+    fourcc: str = "MJPG"  # uncompressed video of more than 640x480 at 30 Hz does not fit through USB 2
     # in units of the camera, 0 is infinity; None leaves autofocus on, which moves the centre
     focus: Finite | None = 0.0
     white_balance_k: NonNegative | None = None  # None leaves it to the camera: tracking uses grey images
     buffers: Few = 2  # of the driver; with one, it has nowhere to put the next image while one is decoded
     # from capture to arrival, where the driver's stamps cannot be used: exposure, readout, USB
     delay_s: NonNegative = 0.05
-    missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
     start_s: NonNegative = 5.0  # until the first image; some cameras take 2 s
-    reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there
-
-
-@dataclass(frozen=True, slots=True)
-class LibraryCameraConfig:
-    """What cameras behind their makers' libraries have in common; docs/sensors.md."""
-
-    device: str = ""  # a serial number, an id; empty: the first that is found
-    width_px: Count = 640  # or the nearest size that the camera has: it is told
-    height_px: Count = 480
-    rate_hz: Positive = 30.0
-    # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera
-    exposure_s: NonNegative | None = 0.01
-    gain: NonNegative | None = None  # in units of the camera; None: its own
-    missing_s: NonNegative = 0.5  # without an image for so long the camera is missing: 15 images at 30 Hz
-    start_s: NonNegative = 10.0  # until the first image; a device that loads its firmware takes some seconds
-    reopen_s: NonNegative = 1.0  # between attempts to open a camera that is not there
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +198,6 @@ class RecordConfig:
     min_free_gb: NonNegative = 1.0  # and when the disk has less left: a full root disk stops the machine
     image_format: Literal["jpg", "png"] = "jpg"  # MJPG cameras give no more; png takes five times the space
     image_queue: Count = 60  # images that may wait for the disk: 2 s, and 55 MB at 640x480
-    imu_queue: Many = 8000  # samples that may wait: 18 s at 450 Hz
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
         transform_points,
     )
     from vislam.core.messages import (
+        NO_IMAGE,
         Array,
         Frame,
+        FurtherTracks,
         ImuSample,
         ImuSpan,
         Keyframe,
@@ -43,10 +45,12 @@ if TYPE_CHECKING:
     from vislam.core.recording import MaskedRecording, Problems, Recording
 
 __all__ = [
+    "NO_IMAGE",
     "Array",
     "Camera",
     "DataError",
     "Frame",
+    "FurtherTracks",
     "ImuSample",
     "ImuSpan",
     "Keyframe",
@@ -79,8 +83,8 @@ __all__ = [
 __getattr__ = late(
     __name__,
     {
-        "Array Frame ImuSample ImuSpan Keyframe KeyframePacket MagSample NavState": "vislam.core.messages",
-        "Observations Tracking VoMeasurement": "vislam.core.messages",
+        "NO_IMAGE Array Frame FurtherTracks ImuSample ImuSpan Keyframe KeyframePacket": "vislam.core.messages",
+        "MagSample NavState Observations Tracking VoMeasurement": "vislam.core.messages",
         "Camera Rig": "vislam.core.camera",
         "DataError UsageError VislamError": "vislam.core.errors",
         "MaskedRecording Problems Recording": "vislam.core.recording",

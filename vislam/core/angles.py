@@ -1,7 +1,5 @@
 """Angles, exact near zero and near half a turn, where the arc cosine loses half of the digits, and directions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

@@ -1,7 +1,5 @@
 """BLAS on one thread: the matrices here are small, so threads cost more than they bring, and change last bits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar

@@ -18,7 +18,20 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
 from vislam.core.jit import njit
-from vislam.core.lens import MODELS, SPHERES, Distortion, Lens, LensModel, bend, distort, imaged, lift, undistort
+from vislam.core.lens import (
+    MODELS,
+    SPHERES,
+    Distortion,
+    Lens,
+    Lenses,
+    LensModel,
+    bend,
+    distort,
+    imaged,
+    lift,
+    table_of,
+    undistort,
+)
 from vislam.core.messages import Array
 from vislam.core.reading import MAX_PIXELS
 
@@ -26,6 +39,8 @@ MapF32 = NDArray[np.float32]
 
 _MIN_Z_M = 1e-6
 _WIDEST_RAD = 1.5  # from the axis, that z = 1 takes from a lens over spheres: 86 deg, at 14 m to the side
+_ASKED = 12  # pixels across and down the first image, by which it is asked what two cameras share
+_LEAST_SHARED = 0.25  # of the first image, at infinity, that makes two cameras a pair
 _LEAST_BASELINE_M = 1e-4  # less is what poses of one place differ by when they are inverted and multiplied
 
 
@@ -119,6 +134,7 @@ class CameraSigmas:
     turn_rad: float = 0.002  # against the camera before it
 
 
+MOST_CAMERAS = 8  # of a rig
 EXACT = CameraSigmas(0.0, 0.0, 0.0)  # of a simulation
 
 
@@ -280,10 +296,21 @@ class Rig:
         """Whether there is no camera."""
         return not self.cameras
 
-    @property
+    @cached_property
     def is_stereo(self) -> bool:
-        """Whether there is a second camera."""
-        return len(self.cameras) > 1
+        """Whether the second camera sees so much of what the first one does that the two measure depth."""
+        if len(self.cameras) < 2:
+            return False
+        first, second = self.cameras[:2]
+        across, down = np.meshgrid(*(np.linspace(0.0, side - 1.0, _ASKED) for side in (first.width, first.height)))
+        rays = first.bearings(np.column_stack([across.ravel(), down.ravel()]))
+        pixels = second.project(rays @ self.T_cam0_cam1[:3, :3])
+        return float(second.contains(pixels).mean()) >= _LEAST_SHARED
+
+    @property
+    def further(self) -> tuple[int, ...]:
+        """Which cameras are followed each by itself: all but the first, and the second where it makes a pair."""
+        return tuple(range(2 if self.is_stereo else 1, len(self.cameras)))
 
     @property
     def T_body_cam0(self) -> Array:
@@ -291,9 +318,14 @@ class Rig:
         return self.T_body_cams[0] if self.cameras else np.eye(4)
 
     @property
-    def lenses(self) -> tuple[Lens, Lens]:
-        """The first two cameras as compiled code takes them; one camera stands for both."""
-        return self.cameras[0].lens, self.cameras[:2][-1].lens
+    def lenses(self) -> Lenses:
+        """All cameras as compiled code takes them."""
+        return table_of([camera.lens for camera in self.cameras])
+
+    @property
+    def T_cam0_cams(self) -> Array:
+        """Poses [C, 4, 4] of all cameras in the first."""
+        return np.array([invert(self.T_body_cams[0]) @ T for T in self.T_body_cams])
 
     @property
     def metres_sigma(self) -> float:

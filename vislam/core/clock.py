@@ -1,7 +1,5 @@
 """How long each stage of the pipeline took, by the wall and in CPU time."""
 
-from __future__ import annotations
-
 import time
 from array import array
 from collections.abc import Iterator

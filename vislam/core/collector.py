@@ -1,7 +1,5 @@
 """Python's collector of cyclic garbage, paused where it costs and finds nothing."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager

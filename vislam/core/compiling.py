@@ -1,7 +1,5 @@
 """Reports when numba compiles while a user waits."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

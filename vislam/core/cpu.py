@@ -1,7 +1,5 @@
 """What this process has used so far: CPU time, compilation apart, and memory."""
 
-from __future__ import annotations
-
 import resource
 import sys
 import threading

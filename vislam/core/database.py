@@ -1,7 +1,5 @@
 """SQLite files that may come from anywhere, opened so that nothing stored in them is ever executed."""
 
-from __future__ import annotations
-
 import sqlite3
 import sys
 from contextlib import suppress

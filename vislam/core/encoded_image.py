@@ -1,12 +1,12 @@
 """Images as files and messages have them: PNG and JPEG only, decoded where their heads state a size that may be."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.reading import MAX_PIXELS
+
+_FREE_PIXELS, _PIXELS_PER_BYTE = 2**23, 8  # 4K of any content; cameras write more than a bit for each pixel
 
 
 def image_size(head: bytes) -> tuple[int, int] | None:
@@ -29,14 +29,19 @@ def image_size(head: bytes) -> tuple[int, int] | None:
     return None
 
 
+def most_pixels(size_bytes: int) -> int:
+    """Return how many pixels an image of that size may have when packed: one beyond 4K must have a content."""
+    return min(MAX_PIXELS, _FREE_PIXELS + _PIXELS_PER_BYTE * size_bytes)
+
+
 def decoded(data: bytes, flags: int, size: tuple[int, int] | None = None) -> NDArray[np.generic] | None:
     """Return the image in the bytes of a PNG or JPEG file as OpenCV's flags ask for it; None where there is none.
 
-    It must be of `size` (width, height), without one of `MAX_PIXELS` at most; a head that states another is not
+    It must be of `size` (width, height) if given, and of `most_pixels` at most; a head that states another is not
     decoded, so that it cannot ask for gigabytes.
     """
     stated = image_size(data)
-    if stated is None or not 0 < stated[0] * stated[1] <= MAX_PIXELS or size not in (None, stated):
+    if stated is None or not 0 < stated[0] * stated[1] <= most_pixels(len(data)) or size not in (None, stated):
         return None
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)

@@ -1,7 +1,5 @@
 """The errors a user of vislam can meet. Each message has what happened, where, asked versus got, and the next step."""
 
-from __future__ import annotations
-
 import copyreg
 import errno
 

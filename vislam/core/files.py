@@ -1,19 +1,22 @@
 """Files that are either whole or not there: written beside their name, then renamed."""
 
-from __future__ import annotations
-
+import csv
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from io import StringIO
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from vislam.core.errors import StorageError
+
+_LINES_AT_ONCE = 4096
 
 
 @contextmanager
@@ -62,6 +65,14 @@ def write_text(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write a file of UTF-8 lines, as `write_text` does, without holding more than some of what `lines` yields."""
+    rest = iter(lines)
+    with replacing(path) as file:
+        while some := list(islice(rest, _LINES_AT_ONCE)):
+            file.write(("\n".join(some) + "\n").encode())
+
+
 def write_json(path: Path, data: Any) -> None:
     """Write plain data as JSON, atomically; numbers that are not finite become null."""
     write_text(path, json.dumps(plain(data), indent=1) + "\n")
@@ -83,3 +94,12 @@ def check_writable(out: Path) -> None:
     there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     if not os.access(there, os.W_OK | os.X_OK):
         raise StorageError(f"{out} cannot be written: no right to write in {there}; choose another --out")
+
+
+def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return rows as CSV with a header."""
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()

@@ -1,7 +1,5 @@
 """What an examination found: the lines that `vislam doctor` prints."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Noise model and calibration of an inertial sensor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -5,8 +5,6 @@ or a disk, keeps the handler waiting. A thread, which receives each signal, too,
 where the main thread did not.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import signal

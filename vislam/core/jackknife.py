@@ -4,8 +4,6 @@ Measurements of one group (an image, a stretch of a recording) share errors, so 
 independent, promise too much (Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

@@ -4,8 +4,6 @@ By itself numba writes beside the source, or under the home, or refuses to impor
 and loading one runs what is in it: so a folder that another user could have written is never used.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 import sys

@@ -1,7 +1,5 @@
 """Tables of kinds by name: what vislam has itself, and what installed packages bring by an entry point."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, TypeVar

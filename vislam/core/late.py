@@ -1,7 +1,5 @@
 """Doors of packages that load what they give only when it is asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any

@@ -13,10 +13,11 @@ Focal lengths are those in the middle of the image for all of them: Kalibr's are
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.jit import njit
 from vislam.core.messages import Array
@@ -25,6 +26,7 @@ Distortion = Literal["none", "radtan", "equidistant", "rational", "ucm", "eucm",
 
 _MAX_NEWTON_STEPS = 20
 SPHERES, _DS, _OMNI = 4, 5, 6  # codes of the models over spheres, which are the last
+_MOST_COEFFICIENTS = 8  # of a rational lens
 _XI, _LIMIT = 5, 6  # where omni's k has what radtan does not know: xi, and the squared radius up to which radtan holds
 _NO_COEFFICIENT = 1e-12  # of a polynomial in r^2: what it changes at any radius that a lens sees is no pixel's part
 
@@ -36,6 +38,32 @@ class Lens(NamedTuple):
     model: int  # the code of one of `MODELS`
     k: Array  # coefficients, as it packs them
     max_r2: float  # squared radius on z = 1 beyond which two rays share a pixel
+
+
+class Lenses(NamedTuple):
+    """Lenses of a rig, C of them, as a table: compiled code is the same however many there are."""
+
+    pinhole: Array  # [C, 5]
+    model: NDArray[np.int64]  # [C]
+    k: Array  # [C, 8]
+    max_r2: Array  # [C]
+
+
+def table_of(lenses: Sequence[Lens]) -> Lenses:
+    """Return lenses as a table."""
+    k = np.zeros((len(lenses), _MOST_COEFFICIENTS))
+    for row, lens in zip(k, lenses, strict=True):
+        row[: len(lens.k)] = lens.k
+    return Lenses(
+        np.array([lens.pinhole for lens in lenses]), np.array([lens.model for lens in lenses], dtype=np.int64), k,
+        np.array([lens.max_r2 for lens in lenses]),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def lens_at(lenses: Lenses, camera: int) -> Lens:
+    """Return the lens of a camera."""
+    return Lens(lenses.pinhole[camera], lenses.model[camera], lenses.k[camera], lenses.max_r2[camera])
 
 
 @njit(cache=True, nogil=True)

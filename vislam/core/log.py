@@ -4,8 +4,6 @@ Modules write to `logging.getLogger(__name__)`. Each record is one line, appende
 crash loses nothing that was said before, and lines of several processes do not mix.
 """
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import os

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 ImageU8 = NDArray[np.uint8]
 ImageF32 = NDArray[np.float32]
+NO_IMAGE: ImageU8 = np.zeros((0, 0), dtype=np.uint8)
 
 
 class Tracking(StrEnum):
@@ -99,6 +100,15 @@ class ImuSpan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FurtherTracks:
+    """Tracked features of a camera beyond the first (pair), which no other camera is asked for; pixels are raw."""
+
+    camera: int  # its number in the rig
+    track_ids: NDArray[np.int64]  # [N], none of another camera's
+    pixels_px: Array  # [N, 2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """Tracked features seen in one frame; pixels are raw (distorted) image coordinates."""
 
@@ -109,11 +119,18 @@ class Observations:
     instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
     noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are given
+    further: tuple[FurtherTracks, ...] = ()  # of the rig's further cameras
 
     def __repr__(self) -> str:
         right = "" if self.right_px is None else f", {int(np.isfinite(self.right_px[:, 0]).sum())} in cam1"
         depth = "" if self.depth_m is None else f", {int(np.isfinite(self.depth_m).sum())} with depth"
-        return f"Observations({len(self.track_ids)} tracks{right}{depth})"
+        further = "".join(f", {len(seen.track_ids)} of cam{seen.camera}" for seen in self.further)
+        return f"Observations({len(self.track_ids)} tracks{right}{depth}{further})"
+
+    @property
+    def are_none(self) -> bool:
+        """Whether no camera sees anything."""
+        return not len(self.track_ids) and not any(len(seen.track_ids) for seen in self.further)
 
 
 def chosen(given: Observations, which: Bools) -> Observations:
@@ -137,7 +154,7 @@ class Frame:
 
     t_ns: int
     index: int
-    images: tuple[ImageU8, ...]  # [H, W] each, cam0 first
+    images: tuple[ImageU8, ...]  # [H, W] each, cam0 first; NO_IMAGE where a further camera gave none
     color: ImageU8 | None = None  # [H, W, 3] BGR of cam0
     depth_m: ImageF32 | None = None  # [H, W] z-depth registered to cam0; 0 or NaN where invalid
     tracks: Observations | None = None  # points already followed elsewhere (simulated vision); `images` is then empty
@@ -150,7 +167,7 @@ class Frame:
         return self.masks[camera] if camera < len(self.masks) else None
 
     def __repr__(self) -> str:
-        has = [f"{image.shape[1]} x {image.shape[0]} px" for image in self.images]
+        has = [f"{image.shape[1]} x {image.shape[0]} px" for image in self.images if image.size]
         has += [name for name, image in (("colour", self.color), ("depth", self.depth_m)) if image is not None]
         has += [] if self.tracks is None else [f"{len(self.tracks.track_ids)} tracks"]
         return f"Frame({self.index} at {self.t_ns * 1e-9:.3f} s: {', '.join(has) or 'no images'})"

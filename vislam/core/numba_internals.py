@@ -9,8 +9,6 @@ A cached kernel is compiled again where a kernel that it calls, or a constant th
 looks at the kernel's own file alone, and would go on with the old code of another.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from functools import cache

@@ -1,7 +1,5 @@
 """Medians and quantiles of short rows of numbers, in a fifth of the time that numpy takes to look at what it got."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

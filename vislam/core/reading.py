@@ -6,8 +6,6 @@ device may have no end. All refusals are OSErrors with a `strerror`, as those of
 What is parsed here has one budget: what a text asks for is bounded by its length before anything of it is built.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Readings of sensors other than IMU and camera, and where between two keyframes they were taken."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple

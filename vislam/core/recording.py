@@ -1,7 +1,5 @@
 """What every source of measurements offers: dataset readers, the simulated world, live sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Which vislam this is."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 from functools import cache

@@ -1,7 +1,5 @@
 """Grey PNG files beside a recording, named by the stamps of its images: labels of pixels, masks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The numbers of a stream's rows: what is no measurement, what leaps and comes back, and what repeats by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -53,7 +53,7 @@ class Happening(StrEnum):
     )  # fmt: skip
     STEP_FORTH = "step forth", "the clock stepped forth", "bridged like a hole, and late from then on"  # of one stream
     HOLE = "hole", "rows are missing", "bridged by the other sensors"
-    BURST = "burst", "rows that came together have stamps of their arrival", "used with these stamps"
+    BURST = "burst", "rows that came together have stamps of their arrival", "left out where vision has metres"
     SAWTOOTH = "sawtooth", "stamps are rounded, or set right in steps", "used with these stamps"
     WRONG_RATE = "wrong rate", "another rate than the stated one", "the stamps count"
     LOOPED = "looped", "played again from its first row, back", "left out"

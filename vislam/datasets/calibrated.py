@@ -32,19 +32,18 @@ def calibrated(found: Survey, files: CalibrationConfig) -> Survey:
     """
     given = () if files.camera is None else _against_first(Path(files.camera))
     found = _moved(found, given or found.clocks, str(files.camera if given else found.root))
-    if files.camera is not None and found.rig is not None:
-        found = replace(found, rig=_rig(found.rig, Path(files.camera)))
-    elif files.camera is not None and found.known_cameras:
-        found = replace(found, rig=_completed_rig(found, Path(files.camera)), lacking=_without(found, "camera"))
+    if files.camera is not None and (found.rig is not None or found.known_cameras):
+        found = replace(found, rig=_rig(found, Path(files.camera)), lacking=_without(found, "camera"))
     if files.camera is not None:
         found = _with_depth(found, Path(files.camera))
     if files.imu is not None:
         found = replace(found, imu_calibration=read_imu_calibration(Path(files.imu)))
+    topic = next((one.name for one in found.topics if one.taken_for in ("imu0", "rates of imu0")), "")
     if files.imu_noise is not None and found.imu_noise is not None:
-        noise = read_noise(Path(files.imu_noise))
+        noise = read_noise(Path(files.imu_noise), topic)
         found = replace(found, imu_noise=replace(noise, rate_hz=found.imu_noise.rate_hz or noise.rate_hz))
     elif files.imu_noise is not None and "imu_noise" in found.lacking:
-        noise = read_noise(Path(files.imu_noise))
+        noise = read_noise(Path(files.imu_noise), topic)
         found = replace(found, imu_noise=noise, lacking=_without(found, "imu_noise"))
     if files.mag is not None:
         found = replace(found, mag_calibration=read_mag_calibration(Path(files.mag)))
@@ -130,36 +129,27 @@ def _without(found: Survey, name: str) -> dict[str, DataError]:
     return {key: error for key, error in found.lacking.items() if key != name}
 
 
-def _completed_rig(found: Survey, path: Path) -> Rig:
-    """Return the rig of a recording that does not know all of its cameras; the file goes before what it knows."""
-    cameras = read_cameras(path)
-    if len(cameras) < len(found.known_cameras):
-        raise DataError(
-            f"{path} has {len(cameras)} camera, the recording has {len(found.known_cameras)}; calibrate both"
-        )
-    pairs = list(zip(cameras, found.known_cameras, strict=False))
-    T_ins = _placed(cameras, [old.T_body_cam for old in found.known_cameras])
-    joined = [KnownCamera(new.camera, T) for (new, _), T in zip(pairs, T_ins, strict=True)]
-    rig = joined_rig(joined, found.depth is not None)
+def _rig(found: Survey, path: Path) -> Rig:
+    """Return the rig of a recording by a file, which goes before what the recording states of its cameras."""
+    cameras, known = read_cameras(path), found.known_cameras
+    if found.rig is not None:
+        known = tuple(map(KnownCamera, found.rig.cameras, found.rig.T_body_cams))
+    if len(cameras) < len(known):
+        raise DataError(f"{path} has {len(cameras)} camera, the recording has {len(known)}; calibrate both")
+    for index, (new, old) in enumerate(zip(cameras, known, strict=False)):
+        size = (new.camera.width, new.camera.height)
+        if old.camera is not None and size != (old.camera.width, old.camera.height):
+            raise DataError(
+                f"{path}: cam{index} is for {size[0]}x{size[1]}, the recording has "
+                f"{old.camera.width}x{old.camera.height}; calibrate at the size that is recorded"
+            )
+    T_ins = _placed(cameras, [old.T_body_cam for old in known])
+    has_depth = found.depth is not None if found.rig is None else found.rig.has_depth
+    rig = joined_rig([KnownCamera(new.camera, T) for new, T in zip(cameras, T_ins, strict=False)], has_depth)
     if rig is None:
-        missing = next(k for k, one in enumerate(joined) if one.T_body_cam is None)
+        missing = next(k for k, T in enumerate(T_ins) if T is None)
         raise DataError(f"{path} does not state where cam{missing} sits, nor does the recording: it needs T_cam_imu")
     return rig
-
-
-def _rig(recorded: Rig, path: Path) -> Rig:
-    found = read_cameras(path)
-    if len(found) < len(recorded.cameras):
-        raise DataError(f"{path} has {len(found)} camera, the recording has {len(recorded.cameras)}; calibrate both")
-    found = found[: len(recorded.cameras)]
-    for index, (new, old) in enumerate(zip(found, recorded.cameras, strict=True)):
-        if (new.camera.width, new.camera.height) != (old.width, old.height):
-            raise DataError(
-                f"{path}: cam{index} is for {new.camera.width}x{new.camera.height}, "
-                f"the recording has {old.width}x{old.height}; calibrate at the size that is recorded"
-            )
-    poses = [T for T in _placed(found, recorded.T_body_cams) if T is not None]
-    return Rig(tuple(new.camera for new in found), tuple(poses), recorded.has_depth)
 
 
 def _placed(cameras: Sequence[CameraCalibration], recorded: Sequence[Array | None]) -> list[Array | None]:

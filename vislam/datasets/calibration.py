@@ -61,7 +61,10 @@ _SILENT = frozenset({  # keys that say nothing that an estimate could miss, or t
     "gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix",
 })  # fmt: skip
 # a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale
-WEIGHTY = re.compile(r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|time_?(shift|offset)|^td$|scale", re.A)
+WEIGHTY = re.compile(
+    r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|(time|stamp|clock|cam|camera|image|imu)_?(shift|offset|delay|lag)|^td$|scale",
+    re.A,
+)
 _MOST_NAMED = 12
 
 
@@ -148,7 +151,11 @@ def load_yaml(path: Path) -> dict[str, Any]:
         lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
         if len(lines) < len(text.splitlines()):  # OpenCV wants no space behind a colon
             lines = [re.sub(r"^(\s*[A-Za-z_][\w.]*):(?=[\w\[\"+-])", r"\1: ", line) for line in lines]
-        data = parse_yaml("\n".join(lines).replace("!!opencv-matrix", ""))
+        body = next((k for k, line in enumerate(lines) if line[:1].isalpha()), 0)
+        end = next((k for k in range(body, len(lines)) if lines[k].rstrip() == "---"), len(lines))  # rostopic echo
+        if any(lines[end + 1 :]):
+            warn_once(f"{path}: of several documents the first is taken")
+        data = parse_yaml("\n".join(lines[:end]).replace("!!opencv-matrix", ""))
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}") from error
     except ValueError as error:
@@ -187,13 +194,15 @@ def read_imu(path: Path) -> tuple[ImuNoise, Array]:
 
 def read_pose(data: Mapping[str, Any], path: Path) -> Array:
     """Return `T_BS` [4, 4] of a sensor file, identity when it has none; raises DataError unless it is rigid."""
-    return np.eye(4) if data.get("T_BS") is None else _rigid_in(data, "T_BS", path)
+    T = pose_in(data, "T_BS", path)
+    return np.eye(4) if T is None else T
 
 
-def _rigid_in(data: Mapping[str, Any], key: str, path: Path) -> Array:
-    matrix = data[key]
-    holder = matrix if isinstance(matrix, dict) else {"data": matrix}
-    T = np.array(numbers_in(holder, "data", path, 16)).reshape(4, 4)
+def pose_in(data: Mapping[str, Any], key: str, path: Path) -> Array | None:
+    """Return a pose [4, 4] of a file, None when it has none; raises DataError unless it is rigid."""
+    if data.get(key) is None:
+        return None
+    T = np.array(numbers_in(data, key, path, 16)).reshape(4, 4)
     if not are_rotations(T[:3, :3], 1e-3):
         raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
     return T
@@ -225,7 +234,8 @@ def parse_depth_camera(data: Mapping[str, Any], path: Path) -> DepthCamera:
     for key in ("T_color_depth", "intrinsics", "resolution"):
         if data.get(key) is None:
             raise DataError(f"{path}: depth with a lens of its own has no {key}; write {DEPTH_CAMERA_KEYS}")
-    T = _rigid_in(data, "T_color_depth", path)
+    T = pose_in(data, "T_color_depth", path)
+    assert T is not None
     if not np.linalg.norm(T[:3, 3]) <= _MOST_APART_M:
         raise DataError(f"{path}: T_color_depth puts depth {np.linalg.norm(T[:3, 3]):.3g} m from colour; write metres")
     return DepthCamera(parse_camera(data, path, "distortion_coefficients"), T)
@@ -330,8 +340,12 @@ def optional_positive(data: Mapping[str, Any], key: str, path: Path, allow_zero:
 
 
 def numbers_in(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
-    """Return a list (nested lists are joined) of finite numbers; YAML reads 5e-6 as text, so text is converted."""
+    """Return a list (nested lists are joined, OpenCV's matrices opened) of finite numbers.
+
+    YAML reads 5e-6 as text, so text is converted.
+    """
     value = data.get(key)
+    value = value.get("data") if isinstance(value, dict) else value
     flat = _flat(value)
     try:
         numbers = [float(x) for x in flat]
@@ -361,6 +375,12 @@ def _flat(value: Any) -> list[Any]:
 def _listed(keys: list[str]) -> str:
     more = f" and {len(keys) - _MOST_NAMED} more" if len(keys) > _MOST_NAMED else ""
     return ", ".join(key[:40] for key in keys[:_MOST_NAMED]) + more
+
+
+def warn_readout(path: Path, key: str, readout_s: float) -> None:
+    """Warn of a rolling shutter that a file states, and name the setting for it."""
+    if readout_s:
+        warn_once(f"{path}: not used: {key}: give --frontend.readout-s {readout_s:.4g}")
 
 
 @lru_cache(maxsize=256)  # a file is read several times on the way to a run

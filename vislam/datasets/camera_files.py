@@ -12,16 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.camera import Camera
+from vislam.core.camera import MOST_CAMERAS, Camera
 from vislam.core.errors import DataError
-from vislam.core.geometry import are_rotations, invert
+from vislam.core.geometry import invert
 from vislam.core.lens import Distortion
 from vislam.core.messages import Array
-from vislam.datasets.calibration import SIGMA_KEYS, Keys, numbers_in, parse_camera, read_pose, stated_lens
+from vislam.datasets.calibration import (
+    SIGMA_KEYS,
+    Keys,
+    numbers_in,
+    optional_positive,
+    parse_camera,
+    pose_in,
+    stated_lens,
+    warn_readout,
+)
 from vislam.datasets.calibration_text import list_text
 from vislam.datasets.foreign_cameras import foreign_cameras, load_keys
 
-_MAX_CAMERAS = 2
 _RATIONAL = "rational_polynomial"
 _KALIBR_MODELS: dict[Distortion, str] = {
     "radtan": "radtan", "equidistant": "equidistant", "none": "none",
@@ -30,7 +38,6 @@ _KALIBR_MODELS: dict[Distortion, str] = {
 _ROS_MODELS: dict[Distortion, str] = {
     "radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob", "rational": _RATIONAL,
 }  # fmt: skip
-_RIGID = 1e-3
 _FARTHEST_S = 1e9  # clocks that begin in 1970 and at boot
 
 
@@ -46,7 +53,9 @@ class CameraCalibration:
 
 
 def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
-    """Return the calibration of the first two cameras at most in a file of any program that docs/formats.md lists.
+    """Return the calibration of the cameras in a file of any program that docs/formats.md lists.
+
+    Of a chain all are read, of other programs' files the first two.
 
     Raises DataError naming the key; also for a pose, clock or scale that is not understood. Other keys that are not
     used are warned of.
@@ -62,24 +71,25 @@ def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
     if not {"intrinsics", "resolution"} & set(data):
         held = ", ".join(str(key)[:40] for key in list(data)[:8])
         raise DataError(f"{path} holds {held}: no camera calibration that is known; see docs/formats.md")
-    pose = read_pose(data, path) if data.get("T_BS") is not None else None
-    found = CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose)
+    found = CameraCalibration(parse_camera(data, path, "distortion_coefficients"), pose_in(data, "T_BS", path))
     data.name_unused(path, "T_BS")
     return (found,)
 
 
 def _chain(data: Keys, path: Path) -> tuple[CameraCalibration, ...]:
     found: list[CameraCalibration] = []
-    names = [name for k in range(_MAX_CAMERAS) if isinstance(data.get(name := f"cam{k}"), dict)]
+    names = [name for k in range(MOST_CAMERAS) if isinstance(data.get(name := f"cam{k}"), dict)]
     for name in names:
         entry = Keys(data[name])
         camera = parse_camera(entry, path, "distortion_coeffs")
-        T_body_cam, T_cam_before = _place(entry, path), _optional_pose(entry, "T_cn_cnm1", path)
+        T_body_cam, T_cam_before = _place(entry, path), pose_in(entry, "T_cn_cnm1", path)
         T_before_cam = None if T_cam_before is None else invert(T_cam_before)
         if T_body_cam is None and found and T_before_cam is not None:
             before = found[-1].T_body_cam
             T_body_cam = None if before is None else before @ T_before_cam
         found.append(CameraCalibration(camera, T_body_cam, *_offset(entry, path), T_before_cam))
+        line_s = optional_positive(entry, "line_delay", path, allow_zero=True) or 0.0
+        warn_readout(path, "line_delay", line_s * camera.height)
         entry.name_unused(path, "T_cam_imu and timeshift_cam_imu")
     data.name_unused(path, "T_cam_imu in each camera's block", known=(f"cam{k}" for k in range(len(names), 16)))
     return tuple(found)
@@ -87,7 +97,7 @@ def _chain(data: Keys, path: Path) -> tuple[CameraCalibration, ...]:
 
 def _place(entry: Keys, path: Path) -> Array | None:
     """Return the pose [4, 4] of a chain's camera in the body: Kalibr writes its inverse, OpenVINS the pose itself."""
-    T_cam_body, T_body_cam = (_optional_pose(entry, key, path) for key in ("T_cam_imu", "T_imu_cam"))
+    T_cam_body, T_body_cam = (pose_in(entry, key, path) for key in ("T_cam_imu", "T_imu_cam"))
     if (
         T_cam_body is not None
         and T_body_cam is not None
@@ -153,16 +163,6 @@ def _offset(entry: Mapping[str, Any], path: Path) -> tuple[float | None, float |
     if values[0] is not None and abs(values[0]) > _FARTHEST_S:
         raise DataError(f"{path}: timeshift_cam_imu of {values[0]:g} s; it is what two clocks differ by, in seconds")
     return values[0], values[1]
-
-
-def _optional_pose(entry: Mapping[str, Any], key: str, path: Path) -> Array | None:
-    """Return a transform [4, 4] of a chain, None where there is none."""
-    if entry.get(key) is None:
-        return None
-    T = np.array(numbers_in(entry, key, path, 16)).reshape(4, 4)
-    if not are_rotations(T[:3, :3], _RIGID):
-        raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
-    return T
 
 
 def _ros_matrix(name: str, matrix: Array) -> str:

@@ -325,38 +325,39 @@ def judged_turns(
     tracks: Sequence[TurnTracks],
     rows: Callable[[], Iterable[Row[list[float]]]],
     bias_rad_s: Array,
+    name: str = "cam0",
 ) -> list[Finding]:
     """Judge how turns of tracks fit a gyroscope's, as `fit_turns` takes them; where they do not, the inverse is tried.
 
-    Empty where fewer than three places turn. `rows` begins again at every call.
+    `name` is the camera's. Empty where fewer than three places turn. `rows` begins again at every call.
     """
     fit = fit_turns(camera, R_body_cam, tracks, rows(), bias_rad_s)
     if fit is None:
         return []
     inverse = fit_turns(camera, R_body_cam.T, tracks, rows(), bias_rad_s) if fit.differ > _WRONG else None
-    return turn_findings(fit, None if inverse is None else inverse.differ)
+    return turn_findings(fit, None if inverse is None else inverse.differ, name)
 
 
-def turn_findings(fit: TurnFit, inverse_differs: float | None = None) -> list[Finding]:
+def turn_findings(fit: TurnFit, inverse_differs: float | None = None, name: str = "cam0") -> list[Finding]:
     """Judge what would make camera and gyroscope fit: wrong is what its sigma and a good calibration do not explain.
 
     `inverse_differs` is as `fit.differ`, with the inverse of the rotation.
     """
-    what = f"turns seen by cam0 and by the gyro differ by {100.0 * fit.differ:.0f} % in {fit.places} places"
+    what = f"turns seen by {name} and by the gyro differ by {100.0 * fit.differ:.0f} % in {fit.places} places"
     if fit.differ > _WRONG:
         step = "check the rotation in T_BS (is it the camera in the body, not the body in the camera?) and the clocks"
         if inverse_differs is not None and inverse_differs < _WRONG:
             step = f"with the inverse they differ by {100.0 * inverse_differs:.0f} %: write the inverse of its pose"
-        return [Finding("error", f"{what}: extrinsics or time stamps are wrong", "cam0", step)]
-    judged = [] if fit.x is None or fit.covariance is None else _judged(fit.x, fit.covariance)
-    wrong = [Finding("warning", f"by the gyro's turns {text}", "cam0", step) for bad, text, step in judged if bad]
+        return [Finding("error", f"{what}: extrinsics or time stamps are wrong", name, step)]
+    judged = [] if fit.x is None or fit.covariance is None else _judged(fit.x, fit.covariance, name)
+    wrong = [Finding("warning", f"by the gyro's turns {text}", name, step) for bad, text, step in judged if bad]
     if not wrong and fit.differ > _POOR:
-        return [Finding("warning", what, "cam0", "check the rotation in T_BS and the clocks")]
+        return [Finding("warning", what, name, "check the rotation in T_BS and the clocks")]
     found = ", ".join(text for _, text, _ in judged)
-    return wrong or [Finding("ok", f"{what}: {found}" if found else what, "cam0")]
+    return wrong or [Finding("ok", f"{what}: {found}" if found else what, name)]
 
 
-def _judged(x: Array, covariance: Array) -> list[tuple[bool, str, str]]:
+def _judged(x: Array, covariance: Array, name: str) -> list[tuple[bool, str, str]]:
     """Return for focal length, rotation and clock whether it is wrong, what was found and what to do then."""
     sigma, turn, spread = np.sqrt(np.diag(covariance)), x[_TURN], covariance[_TURN, _TURN]
     is_focal = abs(x[_FOCAL]) > _SURE * np.hypot(sigma[_FOCAL], _GOOD_FOCAL)
@@ -373,7 +374,7 @@ def _judged(x: Array, covariance: Array) -> list[tuple[bool, str, str]]:
         ),
         (
             bool(is_turn),
-            f"cam0 is turned by {np.rad2deg(angle):.1f} ± {np.rad2deg(about):.1f} deg against its T_BS",
+            f"{name} is turned by {np.rad2deg(angle):.1f} ± {np.rad2deg(about):.1f} deg against its T_BS",
             "check the rotation in T_BS; `vislam calibrate camera-imu` measures it",
         ),
         (

@@ -1,4 +1,4 @@
-"""Calibrations of other programs, recognised by their content: VINS, ORB-SLAM, Basalt, ROS, OpenCV.
+"""Calibrations of other programs, recognised by their content: VINS, ORB-SLAM, Basalt, OKVIS, maplab, ROS, OpenCV.
 
 Every pose that they write is the camera's in the IMU (`body_T_cam0`, `Tbc`, `T_imu_cam`), or the right camera's in the
 left one's.
@@ -18,36 +18,50 @@ import numpy as np
 
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError
-from vislam.core.geometry import are_rotations, rotation_from_quaternion_xyzw, transform
+from vislam.core.geometry import invert, rotation_from_quaternion_xyzw, transform
 from vislam.core.lens import MODELS, Distortion
 from vislam.core.messages import Array
 from vislam.core.reading import MAX_YAML_BYTES, read_text
-from vislam.datasets.calibration import NOISE_KEYS, WEIGHTY, Keys, load_yaml, numbers_in, stated_camera
+from vislam.datasets.calibration import (
+    WEIGHTY,
+    Keys,
+    load_yaml,
+    numbers_in,
+    optional_positive,
+    pose_in,
+    stated_camera,
+    warn_readout,
+)
 from vislam.datasets.tables import check_size
 
 _RATIONAL = "rational_polynomial"
 _RADTAN = ("k1", "k2", "p1", "p2")
 _FULL = (*_RADTAN, "k3", "k4", "k5", "k6")
-_RIGID = 1e-3
 _OPENCV = {  # what its programs and ROS's messages call the same, in small letters without underscores
     "cameramatrix": "camera_matrix", "k": "camera_matrix", "distortioncoefficients": "distortion_coefficients",
     "distcoeffs": "distortion_coefficients", "d": "distortion_coefficients", "imagewidth": "image_width",
-    "width": "image_width", "imageheight": "image_height", "height": "image_height",
+    "width": "image_width", "imageheight": "image_height", "height": "image_height", "mtx": "camera_matrix",
+    "dist": "distortion_coefficients", "distcoeff": "distortion_coefficients", "imagesize": "image_size",
     "distortionmodel": "distortion_model", "fisheyemodel": "fisheye_model",
 }  # fmt: skip
 _OPENCV_SILENT = (  # of a message, and of the program that calibrates
-    "header", "R", "r", "P", "p", "roi", "calibration_time", "calibration_Time", "nframes", "nrOfFrames", "flags",
+    "header", "R", "r", "P", "p", "calibration_time", "calibration_Time", "nframes", "nrOfFrames", "flags",
     "board_width", "board_height", "square_size", "avg_reprojection_error", "per_view_reprojection_errors",
     "extrinsic_parameters", "image_points", "grid_points",
 )  # fmt: skip
-_ORB_NOISE = dict(
-    zip(("IMU.NoiseGyro", "IMU.NoiseAcc", "IMU.GyroWalk", "IMU.AccWalk"), NOISE_KEYS, strict=True),
-    **{"IMU.Frequency": "update_rate"},
-)
-_BASALT_NOISE = dict(
-    zip(("gyro_noise_std", "accel_noise_std", "gyro_bias_std", "accel_bias_std"), NOISE_KEYS, strict=True),
-    imu_update_rate="update_rate",
-)
+_RESULTS = {  # what is no mapping, by how it begins
+    "Calibration results": "Kalibr's report; give its camchain.yaml",
+    "# oST version": "ROS's ost.txt; give its ost.yaml",
+    "# Camera list": "COLMAP's cameras.txt; write a sensor.yaml, see docs/formats.md",
+    "[LEFT_CAM": "the settings of a ZED; write a sensor.yaml, see docs/formats.md",
+}
+_LISTED = {  # how OKVIS and maplab name distortions, as ROS does
+    "radialtangential": "plumb_bob", "radial-tangential": "plumb_bob", "radialtangential8": _RATIONAL,
+    "equidistant": "equidistant", "none": "none",
+}  # fmt: skip
+_PAIR = (("m", "k", "cameramatrix"), ("d", "distcoeffs", "distortioncoefficients"))  # of OpenCV, before 1 and 2
+_MAPLAB_SILENT = ("label", "id", "description", "topic", "sensor_type", "compressed")
+_MOST_BASELINE_M = 10.0  # more are millimetres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +79,9 @@ def load_keys(path: Path) -> Keys:
     check_size(path, MAX_YAML_BYTES)
     try:
         text = read_text(path, MAX_YAML_BYTES).lstrip("\ufeff \t\r\n")
+        for begin, what in _RESULTS.items():
+            if text.startswith(begin):
+                raise DataError(f"{path} is {what}")
         if not text.startswith(("{", "<")):
             return Keys(load_yaml(path))
         data = json.loads(text) if text.startswith("{") else _xml(text)
@@ -88,24 +105,6 @@ def foreign_cameras(data: Keys, path: Path) -> list[StatedCamera] | None:
                 what = f"no {error}" if isinstance(error, KeyError) else str(error)
                 raise DataError(f"{path} looks like a file of {name}, but it cannot be used: {what[:120]}") from error
     return None
-
-
-def foreign_noise(data: Keys, path: Path) -> Keys:
-    """Return the noise that ORB-SLAM or Basalt states in Kalibr's keys, the data itself where it is of neither.
-
-    Raises DataError for VINS, whose figures are no densities.
-    """
-    if "acc_n" in data:
-        raise DataError(
-            f"{path} is VINS's: its acc_n and gyr_n are tuned figures, not densities; give Kalibr's imu.yaml, or run "
-            "`vislam calibrate noise`"
-        )
-    inner = data.get("value0")
-    for names, holder in ((_BASALT_NOISE, inner), (_ORB_NOISE, data)):
-        if isinstance(holder, dict) and any(name in holder for name in names):
-            stated = {key: numbers_in(holder, name, path) for name, key in names.items() if name in holder}
-            return Keys({key: max(values, default=None) for key, values in stated.items()})
-    return data
 
 
 def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list[float], where: str) -> Camera:
@@ -140,22 +139,29 @@ def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list
 
 
 def _ros_or_opencv(data: Keys, path: Path) -> list[StatedCamera]:
-    if "fx" in data:
-        raise ValueError("camera_matrix and fx at once")
     named = {_OPENCV.get(str(key).lower().replace("_", ""), str(key)): value for key, value in data.items()}
     keys = Keys(named)
-    K = np.array(_matrix(keys, "camera_matrix", path, 9)).reshape(3, 3)
-    sizes = {key: [keys.get(key)] for key in ("image_width", "image_height")}
-    width, height = (int(numbers_in(sizes, key, path, 1)[0]) for key in sizes)
-    coefficients = _matrix(keys, "distortion_coefficients", path)
+    K = np.array(numbers_in(keys, "camera_matrix", path, 9)).reshape(3, 3)
+    key, sides = "image_size", keys.get("image_size")
+    if sides is None:
+        key, sides = "image_width, image_height", [keys.get("image_width"), keys.get("image_height")]
+    if isinstance(sides, list) and None in sides:
+        raise DataError(f"{path}: a calibration of OpenCV without image size; add image_width and image_height")
+    width, height = map(int, numbers_in({key: sides}, key, path, 2))
+    coefficients = numbers_in(keys, "distortion_coefficients", path)
     # a message names its model; OpenCV's program writes whether it is a fisheye, else the number of coefficients does
     usual = "plumb_bob" if len(coefficients) <= 5 else _RATIONAL
     is_fisheye = str(keys.get("fisheye_model", 0)) not in ("0", "False", "None")
     name = "fisheye" if is_fisheye else str(keys.get("distortion_model", usual))
-    pose = _pose(keys, "T_BS", path)
-    camera = ros_camera((width, height), K, name, coefficients, str(path))
-    if any(str(keys.get(f"binning_{axis}", 0)) not in ("0", "1") for axis in "xy"):
-        raise DataError(f"{path}: binning is not read; calibrate at the size that is recorded")
+    pose = pose_in(keys, "T_BS", path)
+    if keys.get("xi") is None:
+        camera = ros_camera((width, height), K, name, coefficients, str(path))
+    else:  # of OpenCV's module omnidir
+        xi = numbers_in(keys, "xi", path, 1)
+        camera = stated_camera((width, height), K, "omni", [*xi, *coefficients], str(path))
+    roi = found if isinstance(found := keys.get("roi"), dict) else {}
+    if roi.get("x_offset") or roi.get("y_offset") or any(keys.get(f"binning_{axis}", 0) not in (0, 1) for axis in "xy"):
+        raise DataError(f"{path}: binning and parts of an image are not read; calibrate at the size that is recorded")
     keys.name_unused(path, "T_BS", known=_OPENCV_SILENT)
     return [StatedCamera(camera, pose)]
 
@@ -166,27 +172,31 @@ def _vins(data: Keys, path: Path) -> list[StatedCamera]:
     found = []
     if "model_type" in data:
         R, t = (data.get(f"extrinsic{name}") for name in ("Rotation", "Translation"))
-        T = _pose(data, "body_T_cam0", path)
+        T = pose_in(data, "body_T_cam0", path)
         if R is not None and t is not None:
             T = transform(
-                np.reshape(_matrix(data, "extrinsicRotation", path, 9), (3, 3)),
-                np.array(_matrix(data, "extrinsicTranslation", path, 3)),
+                np.reshape(numbers_in(data, "extrinsicRotation", path, 9), (3, 3)),
+                np.array(numbers_in(data, "extrinsicTranslation", path, 3)),
             )
         found.append(StatedCamera(_vins_lens(data, path), T, time_offset_s=offset_s))
     else:
         for k in range(2):
             if data.get(f"cam{k}_calib") is not None:
                 beside = path.with_name(Path(str(data[f"cam{k}_calib"])).name)
-                T = _pose(data, f"body_T_cam{k}", path)
+                T = pose_in(data, f"body_T_cam{k}", path)
                 found.append(StatedCamera(_vins_lens(load_keys(beside), beside), T, time_offset_s=offset_s))
     if str(data.get("estimate_extrinsic", 0)) == "2":  # by which the poses are placeholders
         found = [StatedCamera(one.camera, time_offset_s=offset_s) for one in found]
+    if str(data.get("rolling_shutter", 0)) == "1":
+        warn_readout(path, "rolling_shutter_tr", numbers_in(data, "rolling_shutter_tr", path, 1)[0])
     _refuse_weighty(data, path, "body_T_cam0 and td")
     return found
 
 
 def _vins_lens(data: Keys, path: Path) -> Camera:
     kind = str(data["model_type"])
+    if kind not in ("PINHOLE", "PINHOLE_FULL", "KANNALA_BRANDT", "MEI"):
+        raise DataError(f"{path}: VINS's camera model {kind} is not supported; use PINHOLE, KANNALA_BRANDT or MEI")
     projection, size = data["projection_parameters"], [int(data[f"image_{side}"]) for side in ("width", "height")]
     if kind in ("PINHOLE", "PINHOLE_FULL"):
         K = _intrinsics(*(float(projection[name]) for name in ("fx", "fy", "cx", "cy")))
@@ -196,11 +206,9 @@ def _vins_lens(data: Keys, path: Path) -> Camera:
         K = _intrinsics(*(float(projection[name]) for name in ("mu", "mv", "u0", "v0")))
         k = [float(projection[name]) for name in ("k2", "k3", "k4", "k5")]
         return ros_camera((size[0], size[1]), K, "equidistant", k, str(path))
-    if kind == "MEI":
-        K = _intrinsics(*(float(projection[name]) for name in ("gamma1", "gamma2", "u0", "v0")))
-        k = [data["mirror_parameters"]["xi"], *(data["distortion_parameters"].get(name, 0.0) for name in _RADTAN)]
-        return stated_camera((size[0], size[1]), K, "omni", [float(value) for value in k], str(path))
-    raise DataError(f"{path}: VINS's camera model {kind} is not supported; use PINHOLE, KANNALA_BRANDT or MEI")
+    K = _intrinsics(*(float(projection[name]) for name in ("gamma1", "gamma2", "u0", "v0")))
+    k = [data["mirror_parameters"]["xi"], *(data["distortion_parameters"].get(name, 0.0) for name in _RADTAN)]
+    return stated_camera((size[0], size[1]), K, "omni", [float(value) for value in k], str(path))
 
 
 def _orb_slam(data: Keys, path: Path) -> list[StatedCamera]:
@@ -210,10 +218,10 @@ def _orb_slam(data: Keys, path: Path) -> list[StatedCamera]:
             "Camera2.fx ... and Stereo.T_c1_c2, as since its version 1.0"
         )
     first = "Camera1" if "Camera1.fx" in data else "Camera"
-    T_body_cam = _pose(data, "IMU.T_b_c1", path)
-    T_body_cam = _pose(data, "Tbc", path) if T_body_cam is None else T_body_cam
-    T_c1_c2 = _pose(data, "Stereo.T_c1_c2", path)
-    T_c1_c2 = _pose(data, "Tlr", path) if T_c1_c2 is None else T_c1_c2
+    T_body_cam = pose_in(data, "IMU.T_b_c1", path)
+    T_body_cam = pose_in(data, "Tbc", path) if T_body_cam is None else T_body_cam
+    T_c1_c2 = pose_in(data, "Stereo.T_c1_c2", path)
+    T_c1_c2 = pose_in(data, "Tlr", path) if T_c1_c2 is None else T_c1_c2
     found = [StatedCamera(_orb_lens(data, first, path), T_body_cam)]
     if data.get("Stereo.b") is not None or (data.get("Camera.bf") is not None and "Camera2.fx" not in data):
         b_m = data.get("Stereo.b")
@@ -263,22 +271,102 @@ def _basalt(data: Keys, path: Path) -> list[StatedCamera]:
         else:
             camera = ros_camera(size_px, K, name, k, str(path))
         q = np.array([float(pose[f"q{axis}"]) for axis in "xyzw"])
-        if not abs(np.linalg.norm(q) - 1.0) < _RIGID:
+        if not abs(np.linalg.norm(q) - 1.0) < 1e-3:
             raise DataError(f"{path}: a quaternion of T_imu_cam is not of length 1: {q.tolist()}")
         R = rotation_from_quaternion_xyzw(q[None] / np.linalg.norm(q))[0]
         T = transform(R, np.array([float(pose[f"p{axis}"]) for axis in "xyz"]))
         found.append(StatedCamera(camera, T, time_offset_s=offset_s))
-    keys.name_unused(path, "T_imu_cam and cam_time_offset_ns", known=_BASALT_NOISE)
+    keys.name_unused(
+        path,
+        "T_imu_cam and cam_time_offset_ns",
+        known=[key for key in keys if key.endswith(("_noise_std", "_bias_std", "_update_rate"))],
+    )
     return found
+
+
+def _okvis(data: Keys, path: Path) -> list[StatedCamera]:
+    found = []
+    for entry in data["cameras"][:2]:
+        keys = Keys(entry)
+        width, height = numbers_in(keys, "image_dimension", path, 2)
+        K = _intrinsics(*numbers_in(keys, "focal_length", path, 2), *numbers_in(keys, "principal_point", path, 2))
+        name, k = _LISTED.get(str(keys["distortion_type"]), ""), numbers_in(keys, "distortion_coefficients", path)
+        if not name:
+            raise DataError(f"{path}: OKVIS's distortion {keys['distortion_type']} is not supported; use {[*_LISTED]}")
+        found.append(
+            StatedCamera(ros_camera((int(width), int(height)), K, name, k, str(path)), pose_in(keys, "T_SC", path))
+        )
+    if float(dict(data.get("camera_params", data.get("camera_parameters")) or {}).get("image_delay", 0.0)):
+        raise DataError(
+            f"{path}: the sign of OKVIS's image_delay is not known; set it to 0, time offsets are estimated"
+        )
+    _refuse_weighty(data, path, "T_SC in each camera's block")
+    return found
+
+
+def _maplab(data: Keys, path: Path) -> list[StatedCamera]:
+    found = []
+    for entry in data["cameras"][:2]:
+        keys, lens = Keys(entry), Keys(entry["camera"])
+        distortion = dict(lens.get("distortion") or {"type": "none"})
+        name, kind = _LISTED.get(str(distortion["type"]), ""), str(lens["type"])
+        if kind != "pinhole" or not name:
+            raise DataError(
+                f"{path}: maplab's {kind} with {distortion['type']} is not supported; use pinhole, {[*_LISTED]}"
+            )
+        K = _intrinsics(*numbers_in(lens, "intrinsics", path, 4))
+        k = numbers_in(distortion, "parameters", path) if "parameters" in distortion else []
+        camera = ros_camera((int(lens["image_width"]), int(lens["image_height"])), K, name, k, str(path))
+        found.append(StatedCamera(camera, pose_in(keys, "T_B_C", path)))
+        delay_ns = optional_positive(lens, "line-delay-nanoseconds", path, allow_zero=True) or 0.0
+        warn_readout(path, "line-delay-nanoseconds", delay_ns * 1e-9 * camera.height)
+        for part in (keys, lens):
+            part.name_unused(path, "T_B_C in each camera's block", known=("camera", *_MAPLAB_SILENT))
+    data.name_unused(path, "T_B_C in each camera's block", known=_MAPLAB_SILENT)
+    return found
+
+
+def _opencv_pair(data: Keys, path: Path) -> list[StatedCamera]:
+    """Return a pair as OpenCV's program calibrates it: R and T take points of the left camera into the right one."""
+    named = {str(key).lower().replace("_", ""): str(key) for key in data}
+    size = [named[key] for key in ("imagewidth", "imageheight") if key in named]
+    beside = path.with_name(f"extrinsics{path.suffix}")
+    place = data if data.get("R") is not None else load_keys(beside)  # its program writes two files
+    t = np.array(numbers_in(place, "T", path, 3))
+    if len(size) < 2 or np.linalg.norm(t) > _MOST_BASELINE_M:
+        lacks = (
+            f"T of {np.linalg.norm(t):.3g} m is no pair's: write metres" if len(size) == 2 else "it has no image size"
+        )
+        raise DataError(
+            f"{path}: a pair of OpenCV; {lacks}" + ("" if len(size) == 2 else ": add image_width, image_height")
+        )
+    cameras = []
+    for k in "12":
+        K, d = (next(named[of + k] for of in names if of + k in named) for names in _PAIR)
+        cameras.append(ros_camera(
+            (int(data[size[0]]), int(data[size[1]])), np.reshape(numbers_in(data, K, path, 9), (3, 3)), _RATIONAL,
+            numbers_in(data, d, path), str(path)))  # fmt: skip
+    T = invert(transform(np.reshape(numbers_in(place, "R", path, 9), (3, 3)), t))
+    return [StatedCamera(cameras[0]), StatedCamera(cameras[1], T_before_cam=T)]
 
 
 _PROGRAMS: tuple[tuple[str, Callable[[Keys], bool], Callable[[Keys, Path], list[StatedCamera]]], ...] = (
     ("Basalt", lambda data: isinstance(data.get("value0"), dict), _basalt),
     ("VINS", lambda data: "model_type" in data or "cam0_calib" in data, _vins),
     ("ORB-SLAM", lambda data: "Camera.fx" in data or "Camera1.fx" in data, _orb_slam),
+    ("OKVIS", lambda data: "T_SC" in _first_of(data), _okvis),
+    ("maplab", lambda data: "T_B_C" in _first_of(data), _maplab),
+    ("OpenCV", lambda data: any(f"{name}1" in (str(key).lower().replace("_", "") for key in data)
+                                for name in _PAIR[0]), _opencv_pair),
     ("ROS or OpenCV", lambda data: any(
         _OPENCV.get(str(key).lower().replace("_", "")) == "camera_matrix" for key in data), _ros_or_opencv),
 )  # fmt: skip
+
+
+def _first_of(data: Keys) -> Mapping[str, Any]:
+    """Return the first of a list of cameras, empty without one."""
+    cameras = data.get("cameras")
+    return cameras[0] if isinstance(cameras, list) and cameras and isinstance(cameras[0], dict) else {}
 
 
 def _refuse_weighty(data: Keys, path: Path, instead: str) -> None:
@@ -289,21 +377,6 @@ def _refuse_weighty(data: Keys, path: Path, instead: str) -> None:
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Array:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _matrix(data: Mapping[str, Any], key: str, path: Path, count: int | None = None) -> list[float]:
-    holder = data.get(key)
-    return numbers_in({key: holder.get("data") if isinstance(holder, dict) else holder}, key, path, count)
-
-
-def _pose(data: Keys, key: str, path: Path) -> Array | None:
-    """Return a pose [4, 4], None where there is none."""
-    if data.get(key) is None:
-        return None
-    T = np.reshape(_matrix(data, key, path, 16), (4, 4))
-    if not are_rotations(T[:3, :3], _RIGID):
-        raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
-    return T
 
 
 def _xml(text: str) -> dict[str, Any]:

@@ -17,13 +17,22 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.datasets.calibration import NOISE_KEYS, Keys, load_yaml, numbers_in, parse_noise
 from vislam.datasets.calibration_text import list_text
-from vislam.datasets.foreign_cameras import foreign_noise, load_keys
+from vislam.datasets.foreign_cameras import load_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 Calibration = TypeVar("Calibration", ImuCalibration, MagCalibration)
 
 _IMU_KEYS = {"gyro_bias_rad_s": 3, "accel_bias_m_s2": 3, "gyro_matrix": 9, "accel_matrix": 9}
 _MAG_KEYS = {"mag_bias_ut": 3, "mag_matrix": 9}
+_ORB_NOISE = dict(
+    zip(("IMU.NoiseGyro", "IMU.NoiseAcc", "IMU.GyroWalk", "IMU.AccWalk"), NOISE_KEYS, strict=True),
+    **{"IMU.Frequency": "update_rate"},
+)
+_OKVIS_NOISE = dict(zip(("sigma_g_c", "sigma_a_c", "sigma_gw_c", "sigma_aw_c"), NOISE_KEYS, strict=True))
+_BASALT_NOISE = dict(
+    zip(("gyro_noise_std", "accel_noise_std", "gyro_bias_std", "accel_bias_std"), NOISE_KEYS, strict=True),
+    imu_update_rate="update_rate",
+)
 
 
 def imu_noise_text(noise: ImuNoise, comment: str) -> str:
@@ -39,23 +48,44 @@ def imu_noise_text(noise: ImuNoise, comment: str) -> str:
     )
 
 
-def read_noise(path: Path) -> ImuNoise:
+def read_noise(path: Path, topic: str = "") -> ImuNoise:
     """Return the noise model in a file of Kalibr (also its results), OpenVINS, ORB-SLAM, Basalt, or an ASL sensor.yaml.
 
-    What the file states of the IMU beside its noise (T_i_b, time_offset, Tw) is warned of where it means anything.
+    Of several IMUs it is the one whose `rostopic` is `topic`. What the file states of the IMU beside its noise (T_i_b,
+    time_offset, Tw) is warned of where it means anything.
     Raises DataError naming the key.
     """
-    data = foreign_noise(load_keys(path), path)
+    data = _foreign_noise(load_keys(path), path)
     nested = [str(key) for key, value in data.items() if isinstance(value, dict) and set(NOISE_KEYS) & set(value)]
-    if len(nested) > 1:
-        one = ", ".join(nested)
-        raise DataError(f"{path} holds {len(nested)} IMUs: {one}; give a file with the block of the recording's alone")
-    if nested:
+    chosen = [key for key in nested if len(nested) == 1 or (topic and data[key].get("rostopic") == topic)]
+    if len(chosen) != len(nested[:1]):
+        named, of = ", ".join(nested), f", not one with rostopic {topic}" if topic else ""
+        raise DataError(f"{path} holds {len(nested)} IMUs: {named}{of}; give a file with the recording's block alone")
+    if chosen:
         data.name_unused(path, known=nested)
-        data = Keys(data[nested[0]])
+        data = Keys(data[chosen[0]])
     noise = parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
     data.name_unused(path, known=("model",))
     return noise
+
+
+def _foreign_noise(data: Keys, path: Path) -> Keys:
+    """Return the noise that ORB-SLAM, Basalt or OKVIS states in Kalibr's keys, the data itself where it is of neither.
+
+    Raises DataError for VINS, whose figures are no densities.
+    """
+    if "acc_n" in data:
+        raise DataError(
+            f"{path} is VINS's: its acc_n and gyr_n are tuned figures, not densities; give Kalibr's imu.yaml, or run "
+            "`vislam calibrate noise`"
+        )
+    inner = data.get("value0")
+    listed = data.get("imu_params", data.get("imu_parameters"))
+    for names, holder in ((_BASALT_NOISE, inner), (_ORB_NOISE, data), (_OKVIS_NOISE, listed)):
+        if isinstance(holder, dict) and any(name in holder for name in names):
+            stated = {key: numbers_in(holder, name, path) for name, key in names.items() if name in holder}
+            return Keys({key: max(values, default=None) for key, values in stated.items()})
+    return data
 
 
 def imu_calibration_text(calibration: ImuCalibration, comment: str) -> str:

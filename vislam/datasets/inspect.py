@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,12 @@ from vislam.core.findings import Finding, Severity, worst
 from vislam.core.progress import Progress, silent
 from vislam.core.recording import Problems
 from vislam.datasets import survey as survey_recording
-from vislam.datasets.camera_turns import follow_turns, judged_turns, turn_places
+from vislam.datasets.extrinsics import judged_places, judged_turns_of
 from vislam.datasets.images import (
     DepthFormat,
     ImageList,
     UnreadableImageError,
+    bits_of,
     check_size_px,
     probe,
     read_depth,
@@ -28,10 +30,8 @@ from vislam.datasets.images import (
 )
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.plausibility import (
-    EpipolarFacts,
     ImuFacts,
     camera_tilt_rad,
-    epipolar_facts,
     force_seems_in_g,
     imu_facts,
     mean_force,
@@ -53,9 +53,6 @@ _MOVING_TOLERANCE_M_S2 = 1.0  # what an honest journey may average to
 _MAX_TILT_RAD = np.deg2rad(60.0)
 _MIN_IMU_RATE_HZ = 50.0  # below it, preintegration between frames of 20 Hz has next to nothing to integrate
 _DECODED_PER_CAMERA = 200  # each image's head and end are read; this many, spread evenly, are decoded
-_CHECKED_PAIRS = 6
-_MIN_MATCHES = 60
-_MIN_ON_LINE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +193,7 @@ class _Inspector:
         bad: dict[str, list[Path]] = {}
         stride = max(1, len(images.files) // _DECODED_PER_CAMERA)
         decoded = 0
+        bits = None if camera is None else bits_of(images, camera)
         self._checks.compare(images, repeats(images))
         for i in range(len(images.files)):
             path = images.path(i)
@@ -203,7 +201,7 @@ class _Inspector:
             try:
                 size = probe(path)
                 self._size_bytes += path.stat().st_size
-                if camera is None:
+                if camera is None or bits is None:
                     continue
                 check_size_px(size, camera, path)
                 if i % stride == 0:
@@ -212,7 +210,7 @@ class _Inspector:
                         read_depth(path, camera, DepthFormat())
                         continue
                     until = min(i + stride, len(images.files) - 1)
-                    grey, _ = read_grey_or_color(path, camera)
+                    grey = read_grey_or_color(images, i, camera, bits)[0]
                     self._checks.look_at(images.name, grey, int(images.t_ns[i]), int(images.t_ns[until]))
             except UnreadableImageError as error:
                 bad.setdefault(error.kind, []).append(path)
@@ -224,7 +222,8 @@ class _Inspector:
             what = f"{images.name}: {len(paths)} of {len(images.files)}: {kind}"
             self._add(severity, what, str(paths[0]), "copy the files again; the run skips what it cannot read")
         if not bad and images.files:
-            self._add("ok", f"{images.name}: all images are there, {decoded} of them decoded", images.name)
+            said = "" if bits is None else bits.said
+            self._add("ok", f"{images.name}: all images are there, {decoded} of them decoded{said}", images.name)
 
     def _rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         calibration = self._found.imu_calibration
@@ -300,40 +299,17 @@ class _Inspector:
         try:
             if facts is not None:
                 self._judge_extrinsics(rig, frames, facts)
-            if rig.is_stereo:
-                self._judge_stereo(self._stereo_facts(rig, frames))
+            if len(rig.cameras) > 1:
+                self._findings += judged_places(self._found, rig, frames)
         except DataError as error:
             self._add("error", str(error), str(self._found.root))
 
-    def _stereo_facts(self, rig: Rig, frames: FrameTable) -> EpipolarFacts:
-        chosen = np.unique(np.linspace(0, len(frames.t_ns) - 1, _CHECKED_PAIRS).astype(int))
-        with closing(open_loader(self._found, rig, frames)) as loader:
-            loaded = [loader.load(int(i)).images for i in chosen]
-        return epipolar_facts(rig, [(images[0], images[1]) for images in loaded if images])
-
-    def _judge_stereo(self, facts: EpipolarFacts) -> None:
-        what = f"stereo: {100 * facts.on_line:.0f} % of {facts.matches} matches lie on their epipolar line"
-        if facts.matches < _MIN_MATCHES:
-            self._add("warning", f"stereo: only {facts.matches} matches, too few to judge", "cam1", "more texture")
-        elif facts.on_line < _MIN_ON_LINE:
-            step = "check T_BS of both cameras, and that their images are not swapped"
-            self._add("error", f"{what}: the extrinsics do not fit", "cam1", step)
-        elif facts.in_front < _MIN_ON_LINE:
-            self._add(
-                "error",
-                f"{what}, but behind the cameras",
-                "cam1",
-                "cam0 and cam1 seem to be swapped, or their poses inverted",
-            )
-        else:
-            self._add("ok", what, "cam1")
-
     def _judge_extrinsics(self, rig: Rig, frames: FrameTable, facts: ImuFacts) -> None:
-        with closing(open_loader(self._found, rig, frames, 1)) as loader:
-            tracks = follow_turns(turn_places(facts, frames.t_ns), frames.t_ns, lambda frame: loader.load(frame).images)
-        R_body_cam, bias = rig.T_body_cams[0][:3, :3], facts.gyro_bias_rad_s
-        turns = judged_turns(rig.cameras[0], R_body_cam, tracks, lambda: self._rows(Problems()), bias)
-        self._findings += turns
+        turns, *others = (
+            judged_turns_of(k, self._found, rig, frames, facts, lambda: self._rows(Problems()))
+            for k in (0, *rig.further)
+        )
+        self._findings += [*turns, *chain.from_iterable(others)]
         tilt_rad = camera_tilt_rad(facts, rig)
         tilt = f"gravity is {np.rad2deg(tilt_rad):.0f} deg from the vertical of cam0's image"
         if tilt_rad < _MAX_TILT_RAD or (turns and worst(turns) == "ok"):
@@ -393,7 +369,8 @@ def _message_findings(found: Survey, frames: FrameTable, checks: StreamChecks) -
     except DataError as error:
         return [Finding("error", str(error), str(found.root), "leave the topic out, or record with one size")]
     if not bad:
-        return [Finding("ok", f"{len(chosen)} of {len(frames.t_ns)} frames decoded", str(found.root))]
+        what = f"{len(chosen)} of {len(frames.t_ns)} frames decoded{''.join(bits.said for bits in loader.bits)}"
+        return [Finding("ok", what, str(found.root))]
     step = "the run skips what it cannot read"
     return [
         Finding("error" if len(where) > len(chosen) // 2 else "warning", f"{kind}: {len(where)} of {len(chosen)} "

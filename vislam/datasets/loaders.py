@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -10,15 +11,19 @@ import cv2
 import numpy as np
 
 from vislam.core.camera import Camera, Rig
+from vislam.core.encoded_image import most_pixels
 from vislam.core.errors import DataError
-from vislam.core.messages import ImageF32, ImageU8
+from vislam.core.messages import NO_IMAGE, ImageF32, ImageU8
 from vislam.core.reading import check_file
 from vislam.datasets.images import (
     DepthFormat,
     ImageList,
+    SixteenBits,
     Stamps,
     UnreadableImageError,
+    bits_of,
     check_size_px,
+    grey_and_color,
     read_depth,
     read_grey_or_color,
 )
@@ -27,7 +32,10 @@ from vislam.vision.depth_registration import DepthCamera, DepthRegistration
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedImages:
-    """The images of one frame, or the reason why there are none; `trouble` beside images means depth is missing."""
+    """The images of one frame, or the reason why there are none.
+
+    `trouble` beside images means that depth is missing, or the image of a further camera.
+    """
 
     images: tuple[ImageU8, ...]
     color: ImageU8 | None = None
@@ -45,9 +53,10 @@ class FrameTable:
 
 
 class Loader(Protocol):
-    """Loads the images of frame i; `workers` threads may call it at once."""
+    """Loads the images of frame i; `workers` threads may call it at once, and `bits` are those of its cameras."""
 
     workers: int
+    bits: Sequence[SixteenBits]
 
     def load(self, i: int) -> LoadedImages:
         """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
@@ -56,6 +65,30 @@ class Loader(Protocol):
     def close(self) -> None:
         """Let go of what is open."""
         ...
+
+
+def load_cameras(
+    rig: Rig, rows: Sequence[int], read: Callable[[int, int], tuple[ImageU8, ImageU8 | None]]
+) -> LoadedImages:
+    """Return the images of a frame's cameras; none where one that is needed cannot be read.
+
+    Args:
+        rig: of at least as many cameras.
+        rows: which image of each camera it is; -1: a further camera has none.
+        read: returns grey and colour of a camera's image by its number and row.
+    """
+    images: list[ImageU8] = []
+    color, trouble = None, None
+    for camera, row in enumerate(rows):
+        try:
+            grey, bgr = (NO_IMAGE, None) if row < 0 else read(camera, row)
+        except UnreadableImageError as error:
+            if camera not in rig.further:
+                return LoadedImages((), trouble=error)
+            grey, bgr, trouble = NO_IMAGE, None, error
+        images.append(grey)
+        color = bgr if camera == 0 else color
+    return LoadedImages(tuple(images), color, trouble=trouble)
 
 
 class FolderLoader:
@@ -76,25 +109,23 @@ class FolderLoader:
         self._depth = depth
         self._rig = rig
         self._depth_format = depth_format
+        self.bits: Sequence[SixteenBits] = [bits_of(*each) for each in zip(cameras, rig.cameras, strict=False)]
 
     def load(self, i: int) -> LoadedImages:
         """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
-        images, color = [], None
-        try:
-            for index, (camera, stream) in enumerate(zip(self._rig.cameras, self._cameras, strict=False)):
-                grey, bgr = read_grey_or_color(stream.path(int(self._frames.camera_rows[i, index])), camera)
-                images.append(grey)
-                color = bgr if index == 0 else color
-        except UnreadableImageError as error:
-            return LoadedImages((), trouble=error)
+        rows = self._frames.camera_rows[i].tolist()[: len(self._cameras)]
+        loaded = load_cameras(
+            self._rig, rows,
+            lambda k, row: read_grey_or_color(self._cameras[k], row, self._rig.cameras[k], self.bits[k]),
+        )  # fmt: skip
         depth_row = int(self._frames.depth_rows[i])
-        if self._depth is None or depth_row < 0:
-            return LoadedImages(tuple(images), color)
+        if not loaded.images or self._depth is None or depth_row < 0:
+            return loaded
         try:
             depth_m = read_depth(self._depth.path(depth_row), self._rig.cameras[0], self._depth_format)
         except UnreadableImageError as error:
-            return LoadedImages(tuple(images), color, trouble=error)
-        return LoadedImages(tuple(images), color, depth_m)
+            return replace(loaded, trouble=error)
+        return replace(loaded, depth_m=depth_m)
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -105,7 +136,7 @@ class RegisteringLoader:
 
     def __init__(self, loader: Loader, depth: DepthCamera, color: Camera) -> None:
         """Take what loads the images as they are stored."""
-        self.workers = loader.workers
+        self.workers, self.bits = loader.workers, loader.bits
         self._loader, self._registration = loader, DepthRegistration(depth, color)
 
     def load(self, i: int) -> LoadedImages:
@@ -124,6 +155,7 @@ class VideoLoader:
     """Loads frames from a video file and those that follow it, in rising order only, in one thread."""
 
     workers = 1
+    bits: Sequence[SixteenBits] = ()
 
     def __init__(
         self, path: Path, frame_numbers: tuple[str, ...], camera: Camera, later: tuple[tuple[Path, int], ...] = ()
@@ -151,10 +183,8 @@ class VideoLoader:
         if not ok or image is None:
             return LoadedImages((), trouble=UnreadableImageError("video frame", self._path))
         check_size_px((image.shape[1], image.shape[0]), self._camera, self._path)
-        image = np.asarray(image, dtype=np.uint8)
-        if image.ndim == 2:
-            return LoadedImages((image,))
-        return LoadedImages((np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8),), image)
+        grey, color = grey_and_color(np.asarray(image, dtype=np.uint8))
+        return LoadedImages((grey,), color)
 
     def close(self) -> None:
         """Close the video file."""
@@ -179,6 +209,9 @@ def open_video(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(f"{path} cannot be opened as a video; check that it plays, or convert it to H.264 or MJPEG")
+    width, height = _video_size(capture)
+    if width * height > most_pixels(path.stat().st_size):
+        raise DataError(f"{path}: {width}x{height} pixels are far more than its bytes can hold; convert it smaller")
     return capture
 
 

@@ -9,14 +9,12 @@ from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.angles import angle_between
 from vislam.core.camera import Rig
-from vislam.core.geometry import invert, skew
-from vislam.core.messages import Array, ImageU8
+from vislam.core.messages import Array
 from vislam.datasets.tables import Row
 from vislam.imu.rest import is_still
 
@@ -26,10 +24,7 @@ _WINDOW_NS = 500_000_000
 _REST = (0.05, 0.3, 0.2)  # rad/s, m/s^2: a hand or an idling motor shakes more; rad/s: above any sane gyro bias
 _CORNERS = 300
 _MIN_TRACKS = 40
-_MATCH_RATIO = 0.8
-_EPIPOLAR_LIMIT_PX = 2.0
 _INLIER_PX = 1.5
-_TURN_SPAN_NS = 200_000_000
 _MIN_TURN_RAD = np.deg2rad(3.0)  # a smaller turn shows little beside bias and noise of a few tracks
 
 
@@ -117,59 +112,3 @@ def camera_tilt_rad(facts: ImuFacts, rig: Rig) -> float:
     chosen = facts.accel_mean[facts.at_rest] if facts.at_rest.any() else facts.accel_mean
     up_cam = rig.T_body_cams[0][:3, :3].T @ chosen.mean(axis=0)
     return angle_between(up_cam, np.array([0.0, -1.0, 0.0]))
-
-
-@dataclass(frozen=True, slots=True)
-class EpipolarFacts:
-    """How matched features of stereo pairs fit the extrinsics."""
-
-    matches: int
-    on_line: float  # fraction of matches within 2 px of their epipolar line
-    in_front: float  # fraction of those that lie in front of both cameras
-
-
-def epipolar_facts(rig: Rig, pairs: Iterable[tuple[ImageU8, ImageU8]]) -> EpipolarFacts:
-    """Match ORB features between the cameras and compare with the epipolar geometry of the rig.
-
-    Raises DataError where both cameras sit at one place.
-    """
-    rig.check_baseline()
-    T_cam1_cam0 = invert(rig.T_cam0_cam1)
-    R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
-    E = skew(t) @ R
-    matches, on_line, in_front = 0, 0, 0
-    for left, right in pairs:
-        pixels = _match(left, right)
-        first, second = rig.cameras[0].unproject(pixels[:, :2]), rig.cameras[1].unproject(pixels[:, 2:])
-        usable = np.all(np.isfinite(np.hstack([first, second])), axis=1)
-        first, second = first[usable], second[usable]
-        lines1, lines0 = first @ E.T, second @ E
-        slope = np.sum(lines1[:, :2] ** 2, axis=1) + np.sum(lines0[:, :2] ** 2, axis=1)
-        sampson_px = np.abs(np.sum(second * lines1, axis=1)) / np.sqrt(np.maximum(slope, 1e-18)) * rig.cameras[0].fx
-        close = sampson_px < _EPIPOLAR_LIMIT_PX
-        matches += len(first)
-        on_line += int(close.sum())
-        in_front += _count_in_front(first[close] @ R.T, second[close], t)
-    return EpipolarFacts(matches, on_line / max(matches, 1), in_front / max(on_line, 1))
-
-
-def _match(left: ImageU8, right: ImageU8) -> Array:
-    """Return matched pixels [N, 4] (left x, y, right x, y) that pass the ratio test."""
-    orb = cv2.ORB.create(nfeatures=800)
-    points0, descriptors0 = orb.detectAndCompute(left, None)
-    points1, descriptors1 = orb.detectAndCompute(right, None)
-    if descriptors0 is None or descriptors1 is None or len(points1) < 2:
-        return np.empty((0, 4))
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(descriptors0, descriptors1, k=2)
-    good = [m[0] for m in pairs if len(m) == 2 and m[0].distance < _MATCH_RATIO * m[1].distance]
-    return np.array([[*points0[m.queryIdx].pt, *points1[m.trainIdx].pt] for m in good]).reshape(-1, 4)
-
-
-def _count_in_front(rays0: Array, rays1: Array, t: Array) -> int:
-    """Count points with positive depth on both rays: least squares of depth0 * ray0 + t = depth1 * ray1, cam1 axes."""
-    a, b, c = np.sum(rays0**2, axis=1), np.sum(rays0 * rays1, axis=1), np.sum(rays1**2, axis=1)
-    d, e = rays0 @ t, rays1 @ t
-    # times the determinant a c - b b, which is never negative and near zero for points far away: those count as seen
-    depth0, depth1 = b * e - c * d, a * e - b * d
-    far = (a * c - b * b) < 1e-6 * a * c
-    return int(np.count_nonzero(far | ((depth0 > 0.0) & (depth1 > 0.0))))

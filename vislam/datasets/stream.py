@@ -25,6 +25,7 @@ from vislam.datasets.images import (
     UnreadableImageError,
     check_size_px,
     decode_ahead,
+    frames_ahead,
     match_by_time,
     probe,
 )
@@ -36,6 +37,7 @@ from vislam.trajectory import Trajectory
 
 STEREO_TOLERANCE_NS = 2_000_000  # at 1 m/s the body moves 2 mm in it, far less than any baseline
 DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
+_NO_PARTNER = "stereo image without partner"
 FRAME_HOLE_S = 0.5  # of images, that is worth reporting
 IMU_HOLE_S = MachineConfig().max_gap_s  # spans are interpolated over shorter ones
 
@@ -167,16 +169,22 @@ def image_list(
 
 
 def frame_table(survey: Survey, problems: Problems) -> FrameTable:
-    """Return which images form a frame; stereo images without a partner and frames without depth are counted."""
+    """Return which images form a frame; stereo images without a partner and frames without depth are counted.
+
+    Cameras that make no pair with the first may lack an image of a frame: -1.
+    """
     if not survey.cameras:
         return FrameTable(np.zeros(0, np.int64), np.zeros((0, 0), np.int64), np.zeros(0, np.int64))
     first = survey.cameras[0].t_ns
     rows = [np.arange(len(first))]
-    for other in survey.cameras[1:]:
+    further = () if survey.rig is None else survey.rig.further
+    for number, other in enumerate(survey.cameras[1:], start=1):
         rows.append(match_by_time(first, other.t_ns, STEREO_TOLERANCE_NS))
-        problems.count("stereo image without partner", times=_unpaired(rows[-1], len(other.t_ns)))
+        what = f"frame without an image of {other.name}, or the reverse" if number in further else _NO_PARTNER
+        problems.count(what, times=_unpaired(rows[-1], len(other.t_ns)))
     camera_rows = np.stack(rows, axis=1)
-    camera_rows = camera_rows[np.all(camera_rows >= 0, axis=1)]
+    needed = [number for number in range(len(rows)) if number not in further]
+    camera_rows = camera_rows[np.all(camera_rows[:, needed] >= 0, axis=1)]
     t_ns = first[camera_rows[:, 0]]
     depth_rows = np.full(len(t_ns), -1, dtype=np.int64)
     if survey.depth is not None:
@@ -208,6 +216,22 @@ def _stored_loader(survey: Survey, rig: Rig, frames: FrameTable, cameras: int | 
     return FolderLoader(frames, survey.cameras[:cameras], survey.depth, rig, survey.depth_format)
 
 
+def _joined(
+    samples: Iterator[ImuSample | MagSample], frames: Iterator[Frame]
+) -> Iterator[ImuSample | MagSample | Frame]:
+    """Yield both in time order, as `heapq.merge`, which would hold a frame behind the last sample to the very end."""
+    sample = next(samples, None)
+    for frame in frames:
+        while sample is not None and sample.t_ns <= frame.t_ns:
+            yield sample
+            sample = next(samples, None)
+        yield frame
+        del frame  # before the next is decoded
+    while sample is not None:
+        yield sample
+        sample = next(samples, None)
+
+
 class FileRecording:
     """A recording on disk that implements `vislam.core.recording.Recording`.
 
@@ -227,15 +251,15 @@ class FileRecording:
         self.rig: Rig = rig
         self.imu_noise: ImuNoise | None = survey.imu_noise
         self.cameras_read = len(survey.cameras)  # fewer, where the images of the others are not needed
-        self._survey = survey
+        self.survey = survey
         self._counter = Problems()
         self._counter.update(survey.problems)
-        self._frames = frame_table(survey, self._counter)
+        self.frames = frame_table(survey, self._counter)
         self._known = dict(self._counter)
         judges = survey.problems.judges.values()
         self._steps_ns = [step_ns for judge in judges for step_ns in judge.steps_ns]
         self.problems: dict[str, int] = self._counter
-        self.frame_count = len(self._frames.t_ns)
+        self.frame_count = len(self.frames.t_ns)
         if not self.frame_count and survey.cameras:
             names = " and ".join(camera.name for camera in survey.cameras)
             raise DataError(f"{survey.root} has no frame: {names} share no image within {STEREO_TOLERANCE_NS} ns")
@@ -248,18 +272,22 @@ class FileRecording:
         when most rows of a file are unusable.
         """
         self._counter.restart(self._known)
-        self._counter.judges = dict(self._survey.problems.judges)
+        self._counter.judges = dict(self.survey.problems.judges)
         reading = self._read_frames(from_ns)
-        with closing(reading) as frames, closing(self._read_imu()) as imu, closing(self._read_mag()) as mag:
-            streams: list[Iterator[ImuSample | MagSample | Frame]] = [imu, mag, frames]
-            yield from heapq.merge(*streams, key=lambda event: event.t_ns)
+        with (
+            closing(reading) as frames,
+            closing(self.imu_samples(self._counter)) as imu,
+            closing(self._read_mag()) as mag,
+        ):
+            samples: list[Iterator[ImuSample | MagSample]] = [imu, mag]
+            yield from _joined(heapq.merge(*samples, key=lambda sample: sample.t_ns), frames)
 
     def truth(self) -> Trajectory | None:
         """Return the true body trajectory, or None; raises DataError when its file is unusable."""
-        if self._survey.truth is None:
+        if self.survey.truth is None:
             return None
         met = Problems()
-        trajectory = self._survey.truth(met)
+        trajectory = self.survey.truth(met)
         self._known.update(met)
         self._counter.update(met)
         return trajectory
@@ -269,10 +297,10 @@ class FileRecording:
 
         Their unit is the file's. Raises DataError when most of its rows are unusable.
         """
-        if self._survey.forces is None:
+        if self.survey.forces is None:
             return None
         met = Problems()
-        rows = list(in_time_order(self._survey.forces(met), met, "accelerometer"))
+        rows = list(in_time_order(self.survey.forces(met), met, "accelerometer"))
         self._known.update(met)
         self._counter.update(met)
         return np.array([t for t, _ in rows], dtype=np.int64), np.array([f for _, f in rows]).reshape(-1, 3)
@@ -281,15 +309,17 @@ class FileRecording:
         """Compare the first readable image of each camera with its calibration, before a run starts."""
         if self.rig.is_blind:
             return
-        if self._survey.video is not None:
-            open_loader(self._survey, self.rig, self._frames).close()
+        if self.survey.video is not None:
+            open_loader(self.survey, self.rig, self.frames).close()
             return
-        if self._survey.streams is not None:
-            with closing(open_loader(self._survey, self.rig, self._frames)) as loader:
+        if self.survey.streams is not None:
+            with closing(open_loader(self.survey, self.rig, self.frames)) as loader:
                 next((i for i in range(min(100, self.frame_count)) if loader.load(i).images), None)
             return
-        for column, (camera, stream) in enumerate(zip(self.rig.cameras, self._survey.cameras, strict=True)):
-            for row in self._frames.camera_rows[:100, column]:
+        for column, (camera, stream) in enumerate(zip(self.rig.cameras, self.survey.cameras, strict=True)):
+            for row in self.frames.camera_rows[:100, column]:
+                if row < 0:
+                    continue
                 try:
                     check_size_px(probe(stream.path(int(row))), camera, stream.path(int(row)))
                     break
@@ -300,10 +330,12 @@ class FileRecording:
         last_ns = None
         if self.rig.is_blind:
             return
-        with closing(open_loader(self._survey, self.rig, self._frames, self.cameras_read)) as loader:
-            index = 0 if from_ns is None else int(np.searchsorted(self._frames.t_ns, from_ns))
-            with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers)) as decoded:
-                for t_ns, loaded in zip(self._frames.t_ns[index:].tolist(), decoded, strict=False):
+        with closing(open_loader(self.survey, self.rig, self.frames, self.cameras_read)) as loader:
+            index = 0 if from_ns is None else int(np.searchsorted(self.frames.t_ns, from_ns))
+            depth = None if self.survey.depth is None else self.survey.depth_format.camera(self.rig.cameras[0])
+            ahead = frames_ahead(self.rig.cameras[: self.cameras_read], depth)
+            with closing(decode_ahead(range(index, self.frame_count), loader.load, loader.workers, ahead)) as decoded:
+                for t_ns, loaded in zip(self.frames.t_ns[index:].tolist(), decoded, strict=False):
                     if loaded.trouble is not None:
                         self._counter.count(loaded.trouble.kind, self._place(loaded.trouble.path))
                     if loaded.images:
@@ -318,29 +350,30 @@ class FileRecording:
 
     def _depth_lag_s(self, index: int) -> float:
         """Return how much later than the images of a frame its depth is stamped, in seconds; 0 without depth."""
-        row = int(self._frames.depth_rows[index])
-        if self._survey.depth is None or row < 0:
+        row = int(self.frames.depth_rows[index])
+        if self.survey.depth is None or row < 0:
             return 0.0
-        return int(self._survey.depth.t_ns[row] - self._frames.t_ns[index]) * 1e-9
+        return int(self.survey.depth.t_ns[row] - self.frames.t_ns[index]) * 1e-9
 
-    def _read_imu(self) -> Generator[ImuSample, None, None]:
-        if not self._survey.has_imu:
+    def imu_samples(self, problems: Problems) -> Generator[ImuSample, None, None]:
+        """Yield the inertial samples, calibrated; what is skipped is counted. Raises DataError as `events`."""
+        if not self.survey.has_imu:
             return
         rate_hz = self.imu_noise.rate_hz if self.imu_noise is not None else 0.0
-        calibration = self._survey.imu_calibration
-        rows = self._survey.imu_rows(self._counter)
-        for t_ns, values in in_time_order(rows, self._counter, "imu", hole_s=IMU_HOLE_S, rate_hz=rate_hz):
+        calibration = self.survey.imu_calibration
+        rows = self.survey.imu_rows(problems)
+        for t_ns, values in in_time_order(rows, problems, "imu", hole_s=IMU_HOLE_S, rate_hz=rate_hz):
             both = np.array(values)
             sample = ImuSample(t_ns, both[:3], both[3:])
             yield sample if calibration is None else calibration.apply(sample)
 
     def _read_mag(self) -> Generator[MagSample, None, None]:
-        calibration = self._survey.mag_calibration
-        rows = self._survey.mag_rows(self._counter)
+        calibration = self.survey.mag_calibration
+        rows = self.survey.mag_rows(self._counter)
         for t_ns, values in in_time_order(rows, self._counter, "mag"):
             raw = MagSample(t_ns, np.array(values))
             field_ut = raw.field_ut if calibration is None else calibration.apply(raw).field_ut
-            yield MagSample(t_ns, self._survey.R_body_mag @ field_ut)
+            yield MagSample(t_ns, self.survey.R_body_mag @ field_ut)
 
     def _place(self, path: Path) -> str:
-        return str(path.relative_to(self._survey.root)) if path.is_relative_to(self._survey.root) else path.name
+        return str(path.relative_to(self.survey.root)) if path.is_relative_to(self.survey.root) else path.name

@@ -36,7 +36,7 @@ class Correction:
         """Travel as plain numbers: dataclasses and arrays by themselves take a third of what the filter then takes."""
         motion = {one.name: _plain(getattr(self.vo, one.name)) for one in fields(VoMeasurement)}
         motion["tracking"] = self.vo.tracking.value
-        seen = self.observations if len(self.observations.track_ids) else None
+        seen = None if self.observations.are_none else self.observations
         others = (self.at_rest, self.on_wheels, self.keyframe_id, self.shows_scale, self.noise, self.imu_until_ns)
         return _correction, (self.t_ns, motion, seen, *others)
 

@@ -1,12 +1,9 @@
 """What the timeline asks of a filter's core, and what both cores are made of."""
 
-from __future__ import annotations
-
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
-from vislam.config import EkfConfig
 from vislam.core.geometry import quaternion_wxyz
 from vislam.core.messages import Array, NavState, NoiseScale
 from vislam.ekf.history import Event, M, Outcome
@@ -26,6 +23,8 @@ ZERO_VELOCITY_SIGMA_M_S = 0.02  # a vehicle "at rest" still sways
 ZERO_RATE_SIGMA_RAD_S = 0.005  # one gyro sample at rest against the bias
 REST_SIGMA_M = 0.002  # sway against the pose at which rest began
 REST_SIGMA_DEG = 0.05
+# what rate and force may have been inside a hole longer than machine.max_gap_s, against their interpolation
+_HOLE_GYRO_RAD_S, _HOLE_ACCEL_M_S2 = 0.5, 2.0
 REST_PAUSE_NS = 300_000_000  # frames at rest this far apart are of one rest: either looked back on all that is between
 
 
@@ -101,11 +100,11 @@ def nominal(state: NavState) -> Array:
     ])  # fmt: skip
 
 
-def imu_sigmas(config: EkfConfig, noise: ImuNoise) -> Array:
+def imu_sigmas(noise: ImuNoise) -> Array:
     """Return what a step takes [6]: densities of gyro and accel, their bias walks, rate and force unseen in a hole."""
     white = [noise.gyroscope_noise_density, noise.accelerometer_noise_density]
     walks = [noise.gyroscope_random_walk, noise.accelerometer_random_walk]
-    return np.array([*white, *walks, config.gap_gyro_rad_s, config.gap_accel_m_s2])
+    return np.array([*white, *walks, _HOLE_GYRO_RAD_S, _HOLE_ACCEL_M_S2])
 
 
 def scaled(sigmas: Array, noise: NoiseScale) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from vislam.config import EkfConfig, MachineConfig
 from vislam.core.geometry import invert
@@ -33,6 +34,7 @@ if TYPE_CHECKING:  # the fast path must not load OpenCV
 
 _MOST_APPLIED = 4096  # readings of further sensors; only a live run asks for them, many times a second
 _TORN = np.array([0.5, 5.0, 3.0, 0.0, 0.0])  # rad, m, m/s: what may have happened meanwhile; biases stay
+_LEVEL_RAD = 0.15  # by a few samples of what hands and wheels accelerate
 _STAMP_JITTER_NS = 1_000_000  # stamps are regular to less: a delay of two frame intervals is two frames
 
 
@@ -68,15 +70,22 @@ class Filtering:
         self._since_ns = state.t_ns
         self.ekf.initialise(state, vo)
 
-    def tear(self, vo: VoMeasurement) -> None:
+    def tear(self, vo: VoMeasurement, T_odom_body: Array | None = None) -> None:
         """Give up what is known of the motion: before the frame of `vo`, which is lost, an unknown time has passed.
 
-        The pose in `odom` stays, as nothing is known that would move it.
+        The pose in `odom` stays, as nothing is known that would move it; or it is `T_odom_body` [4, 4], of a body that
+        may have any velocity now.
         """
         state = self.ekf.state_at(vo.t_ns)
-        if state is not None:
-            covariance = state.covariance + np.diag(np.repeat(_TORN, 3) ** 2)
-            self.ekf.resume(replace(state, covariance=covariance), vo, self.ekf.camera)
+        if state is None:
+            return
+        covariance = state.covariance + np.diag(np.repeat(_TORN, 3) ** 2)
+        if T_odom_body is not None:  # predicted through a hole, the covariance ties tilt and velocity by nothing real
+            R, sigmas = T_odom_body[:3, :3], np.array([_LEVEL_RAD, _LEVEL_RAD, _TORN[0]])
+            turn, motion = R.T @ np.diag(sigmas**2) @ R, np.diag(np.repeat(_TORN[1:3], 3) ** 2)
+            covariance = block_diag(turn, motion, state.covariance[9:, 9:])
+            state = replace(state, T_world_body=T_odom_body, velocity_world_m_s=np.zeros(3))
+        self.ekf.resume(replace(state, covariance=covariance), vo, self.ekf.camera)
 
     def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""

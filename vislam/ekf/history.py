@@ -1,7 +1,5 @@
 """What a filter remembers so that it can go back: measurements in time order and states to start again from."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field

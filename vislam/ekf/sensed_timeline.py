@@ -1,7 +1,5 @@
 """The doors of a filter for sensors other than IMU and camera."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array, NoiseScale

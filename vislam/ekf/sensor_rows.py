@@ -1,7 +1,5 @@
 """Readings of any sensor as both filters take them: refused, linearised, whitened and gated alike."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The filter goes back to the time of a measurement and runs forward again, so the
 measurements, not on when they came. What a state is and how it is corrected is the core's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ each is small: the filter follows them. How fast they change is seen nonetheless
 are as large as the sensor's sigma has it.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple

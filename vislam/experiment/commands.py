@@ -3,8 +3,6 @@
 Nothing of them is imported, linked or installed, so their licences stay theirs.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

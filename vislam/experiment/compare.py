@@ -1,7 +1,5 @@
 """A comparison from plan to report: what is missing runs, all is kept, tables and pictures are written."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing

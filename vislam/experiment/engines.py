@@ -1,7 +1,5 @@
 """Where jobs run: processes of this machine, or a Dask cluster. Both are given the same function of plain data."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed

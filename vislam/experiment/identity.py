@@ -1,7 +1,5 @@
 """What a result depends on besides its configuration: data, code, packages, and how it is measured."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform

@@ -1,7 +1,5 @@
 """A job in a fresh process, so that a crash is its own, its memory is its own, and it can be stopped."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A plan as single runs: each with its labels, its whole configuration and the hash of all that it depends on."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What a job is judged by: every number comes from the files that its run left, and from its own process."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict

@@ -4,8 +4,6 @@ Nothing of them is imported, linked or installed here; each has a driver in peer
 runs, and its own licence.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import subprocess

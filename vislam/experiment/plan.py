@@ -1,7 +1,5 @@
 """The plan of a comparison: sequences, estimators, variants and seeds, from a TOML file."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

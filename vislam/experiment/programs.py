@@ -1,7 +1,5 @@
 """Estimators that are not vislam's: a class with two doors and an answer, on the pipeline's measurements."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Where a job's measurements come from: rendered worlds are recorded once, and every frame's time is taken."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

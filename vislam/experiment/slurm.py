@@ -3,8 +3,6 @@
 python -m vislam.experiment.slurm FOLDER NUMBER      # what a task of the array runs
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 import subprocess

@@ -4,8 +4,6 @@ A covariance [6, 6] is of (rotation [rad], position [m]): rotation perturbed on 
 its own world, as `NavState` has it. It goes through the same statistics as that of our states.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How sure a comparison is: medians with the spread of the ensemble, and paired tests between estimates."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

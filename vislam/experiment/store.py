@@ -1,7 +1,5 @@
 """The results of all comparisons in one SQLite file, by content hash: what is there is never computed again."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -38,8 +36,6 @@ class ResultStore:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = connect(path, timeout=_BUSY_S, isolation_level=None)
             self._prepare()
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=NORMAL")  # a power cut may cost the last results, never the file
 
     def __enter__(self) -> Self:
         return self

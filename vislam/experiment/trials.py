@@ -1,7 +1,5 @@
 """What the jobs of a plan gave, one value per compared trajectory, and the table of what is measured."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Whether the numbers of a comparison come out again: jobs are run again and held against its manifest."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which estimate is the best one, by how much, or why none is: over a whole plan, and on each of its sequences."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

@@ -3,8 +3,6 @@
 Standard input is a pipe that nothing is written to: when it closes, the parent is gone, and the worker ends.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

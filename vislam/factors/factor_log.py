@@ -1,7 +1,5 @@
 """What a run measured, as its session keeps it: enough to estimate everything again without an image."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What was measured, as plain frozen records, from which the graph can be rebuilt and a batch can redo the run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What became of readings in the graph, counted by sensor."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 _ENDS = ("used", "in_window", "early", "dropped", "unusable")  # of a reading that came with a keyframe

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import gtsam
@@ -16,21 +17,52 @@ import numpy as np
 
 from vislam.config import GraphConfig
 from vislam.core.messages import Array
-from vislam.core.readings import OwnStart, PlacedReading
-from vislam.factors.admission import Admission
+from vislam.core.readings import Motion, MotionReadings, OwnStart, PlacedReading
 from vislam.factors.builder import Label, Step
 from vislam.factors.journal import KeyframeRecord
 from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
 from vislam.factors.reading_counts import ReadingCounts
-from vislam.factors.reading_factor import ReadingFactor
+from vislam.factors.reading_factor import ReadingFactor, as_motion
 from vislam.factors.solvers import RELINEARIZE_OWN, RELINEARIZE_TRANSLATION_M
-from vislam.sensors import Suite, Variable
+from vislam.sensors import USER_ERRORS, Suite, Variable
 
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
-
 _REFRESHED = 6  # readings that are linearised anew with a keyframe, or those of one entry where they are more
 _NEWEST, _BLOCK = 20, 40  # entries that are looked at with each keyframe: the newest, and older ones in turn
 _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided by
+
+
+class Admission:
+    """Says which readings are used, and counts those that are not."""
+
+    def __init__(self, suite: Suite, counts: ReadingCounts) -> None:
+        """Set up for the sensors of a machine; `counts` is told."""
+        self._suite = suite
+        self._counts = counts
+
+    def is_usable(self, placed: PlacedReading) -> bool:
+        """Return whether a sensor that is there takes a reading of its own."""
+        if placed.reading.sensor not in self._suite.names:
+            self._counts.add(placed.reading.sensor, "unknown")
+            return False
+        try:
+            why = self._suite.why_unusable(placed.reading)
+        except USER_ERRORS as error:
+            why = str(error) or type(error).__name__
+        if why:
+            self._counts.add(placed.reading.sensor, "unusable")
+        return not why
+
+    def for_window(self, motions: Sequence[MotionReadings], k: int) -> list[Motion]:
+        """Return what a window takes of each sensor between keyframe k and the one before, where vision was lost."""
+        out = []
+        for motion in motions:
+            name = motion.sensor
+            placed = [one for one in motion.placed if self.is_usable(one)]
+            if placed:
+                self._counts.add(name, "in_window", len(placed))
+                out.append(as_motion(self._suite[name], placed, motion.own, partial(self._counts.fail, name, -k)))
+        return out
 
 
 @dataclass(slots=True)

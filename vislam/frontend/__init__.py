@@ -1,23 +1,31 @@
 """Visual odometry: mono, stereo, RGB-D and planar front ends behind one protocol."""
 
-from __future__ import annotations
-
 from vislam.config import FrontEndConfig
 from vislam.config.frontend import Mode
 from vislam.core.camera import Rig
 from vislam.core.errors import UsageError
 from vislam.core.kinds import Kinds, lacking
+from vislam.frontend.further_cameras import WithFurtherCameras
 from vislam.frontend.metric import RgbdFrontEnd, StereoFrontEnd
 from vislam.frontend.mono import MonoFrontEnd
 from vislam.frontend.no_camera import NoFrontEnd
 from vislam.frontend.planar import PlanarFrontEnd
-from vislam.frontend.result import CommonErrors, FrontEnd, TrackResult
+from vislam.frontend.result import CommonErrors, FrontEnd, FrontEndKind, TrackResult
 from vislam.imu import ImuNoise
 
-__all__ = ["FRONT_ENDS", "FrontEnd", "TrackResult", "common_errors", "knows_scale", "make_frontend", "mode_for"]
+__all__ = [
+    "FRONT_ENDS",
+    "FrontEnd",
+    "FrontEndKind",
+    "TrackResult",
+    "common_errors",
+    "knows_scale",
+    "make_frontend",
+    "mode_for",
+]
 
 
-FRONT_ENDS = Kinds[type[FrontEnd]](
+FRONT_ENDS = Kinds[type[FrontEndKind]](
     "vislam.front_ends",
     {
         "rgbd": RgbdFrontEnd,
@@ -60,4 +68,5 @@ def common_errors(config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> C
 
 def make_frontend(config: FrontEndConfig, rig: Rig, seed: int) -> FrontEnd:
     """Return the front end of `mode_for`; raises UsageError when the rig lacks what the mode needs."""
-    return FRONT_ENDS[mode_for(config, rig)](config, rig, seed)
+    front = FRONT_ENDS[mode_for(config, rig)](config, rig, seed)
+    return WithFurtherCameras(front, config, rig) if rig.further else front

@@ -1,7 +1,5 @@
 """One try to place a frame relative to its keyframe: where it is looked for, and whether its tracks agree on it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar

@@ -1,7 +1,5 @@
 """A first keyframe without depth: where its tracks went since, and how the camera turned."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

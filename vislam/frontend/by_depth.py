@@ -5,8 +5,6 @@ slides, a corridor in one direction) is kept from the prediction, with its growi
 large the frame is lost as before.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ never so far that time would not advance. While a start is awaited it has to be 
 tracked rotation last for many frames, which its sigma takes for independent, and a wrong clock voids the attempts.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -8,8 +8,6 @@ Forssen, "Scan rectification for structured light range sensors with rolling shu
 once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

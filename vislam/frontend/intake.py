@@ -1,7 +1,5 @@
 """The door of a front end: what a camera delivers, and what every frame is checked for before it is looked at."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -47,8 +45,9 @@ class Intake:
                 f"frame {frame.index} at {frame.t_ns} ns does not come after the one at {self._t_ns} ns; "
                 "frames must be in time order"
             )
-        for camera, image in zip(self._rig.cameras, frame.images, strict=False):
-            camera.check_image(image)
+        for number, (camera, image) in enumerate(zip(self._rig.cameras, frame.images, strict=False)):
+            if image.size or number not in self._rig.further:
+                camera.check_image(image)
         if frame.depth_m is not None:
             self._rig.cameras[0].check_image(frame.depth_m)
         if frame.tracks is not None:
@@ -122,7 +121,7 @@ class CameraFeed:
         if self._last_t_ns is not None and usual_ns:
             self.missing += max(round((frame.t_ns - self._last_t_ns) / usual_ns) - 1, 0)
         self._before_ns, self._last_t_ns = self._last_t_ns, frame.t_ns
-        images = tuple(self._seen(f"cam{k}", image) for k, image in enumerate(frame.images))
+        images = tuple(self._seen(f"cam{k}", image) if image.size else image for k, image in enumerate(frame.images))
         if not images:
             self._judges["cam0"].takes(frame.t_ns)
         depth_m = frame.depth_m

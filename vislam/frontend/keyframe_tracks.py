@@ -1,7 +1,5 @@
 """The tracks of the keyframe and the landmarks behind them, as the camera that is looked through sees them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """When a frame becomes a keyframe, what a keyframe is made of, and the life of the one that frames are placed by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,7 +15,8 @@ from vislam.vision.features import describe
 
 PATIENCE_S = 0.4  # so long a lost keyframe is searched for before a new one starts
 _KEYFRAME_ROTATION_DEG = 15.0  # patches turn with the camera and stop matching
-_KEYFRAME_MIN_ALIVE = 0.45  # fraction of the keyframe's tracks that are still followed
+# fraction of the keyframe's tracks that are still followed, and the same where a frame without depth would follow it
+_KEYFRAME_MIN_ALIVE, _KEYFRAME_MIN_ALIVE_UNFIT = 0.45, 0.2
 _RESTART_KEYFRAMES = 8  # after a loss, so many come as soon as they may: chances to recognise the place
 
 
@@ -41,7 +40,7 @@ def keyframe_reason(departure: Departure, config: FrontEndConfig, spacing: float
     makes sure that the graph hears of a camera that hardly moves. `spacing` widens the distances and times: 1 where
     the back end keeps up.
     """
-    least = _KEYFRAME_MIN_ALIVE if departure.fit else config.keyframe_min_alive_unfit
+    least = _KEYFRAME_MIN_ALIVE if departure.fit else _KEYFRAME_MIN_ALIVE_UNFIT
     if departure.alive < least:
         return f"only {departure.alive:.0%} of the tracks left"
     if not departure.fit or departure.dt_s < spacing * config.keyframe_min_interval_s:

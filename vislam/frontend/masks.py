@@ -1,7 +1,5 @@
 """Which pixels of the images are not to be used: a robot's own parts, and what moves by itself."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Mapping

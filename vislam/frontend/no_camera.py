@@ -1,7 +1,5 @@
 """The front end of a body without a camera: it sees nothing, and places nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.config import FrontEndConfig

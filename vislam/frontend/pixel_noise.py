@@ -6,8 +6,6 @@ not by what was told. Frames are averaged in the logarithm, over some seconds, s
 the run noisy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

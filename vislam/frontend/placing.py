@@ -1,7 +1,5 @@
 """Frames placed by the landmarks of their keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

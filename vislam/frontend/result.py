@@ -52,21 +52,8 @@ class FrontEnd(Protocol):
     knows_scale: bool  # whether its motions are in metres
     keyframe_spacing: float  # widens the distances between keyframes; 1, unless a live back end does not keep up
 
-    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
-        """Take the cameras to look through; raises UsageError when the rig lacks what the front end needs."""
-        ...
-
-    @classmethod
-    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
-        """Return what motions seen by a rig have in common; `noise` is the IMU's, None without one."""
-        ...
-
     def track(
-        self,
-        frame: Frame,
-        imu: ImuSpan | None,
-        gyro_sigma_rad_s: float = np.inf,
-        T_last_now: Array | None = None,
+        self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float = np.inf, T_last_now: Array | None = None
     ) -> TrackResult:
         """Follow the last keyframe into `frame`; `imu` is the bias-corrected span since the previous frame.
 
@@ -93,6 +80,19 @@ class FrontEnd(Protocol):
     @property
     def calibration(self) -> dict[str, float]:
         """Return what was learned of the camera's mount, for the report, with standard deviations."""
+        ...
+
+
+class FrontEndKind(FrontEnd, Protocol):
+    """What a mode brings: how it begins, and what its motions have in common."""
+
+    def __init__(self, config: FrontEndConfig, rig: Rig, seed: int) -> None:
+        """Take the cameras to look through; raises UsageError when the rig lacks what the front end needs."""
+        ...
+
+    @classmethod
+    def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:
+        """Return what motions seen by a rig have in common; `noise` is the IMU's, None without one."""
         ...
 
 

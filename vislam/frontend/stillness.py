@@ -8,8 +8,6 @@ A rest that lasts is judged by where its tracks were all the time, too: their me
 than a line through half a second. So it ends with a creep that is too slow for the line, and not with a noisy frame.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np
@@ -22,7 +20,7 @@ _STILL_PX = 0.8  # median image motion over the window and from frame to frame, 
 _NS = 1_000_000_000
 _WINDOW_NS = _NS // 2  # at 1 px over it, a wall 3 m away passes at 13 mm/s
 _MAX_INTERVAL_NS = _NS  # tracks that bridge a longer pause say nothing about what was in it
-_MIN_FRAMES = 3  # a line through two leaves no residual
+MIN_FRAMES = 3  # before a rest shows: a line through two leaves no residual
 _MIN_TRACKS = 10  # fewer say nothing about the motion of the camera
 _HOLD = 1.5  # times the limits over the window, as long as the tracks are where they were when rest began
 _SIGNIFICANT = 3.0  # standard deviations
@@ -64,7 +62,7 @@ class Stillness:
             self.resting = False
         order = np.argsort(seen.track_ids, kind="stable")
         frames.append((t_ns, seen.track_ids[order], seen.pixels_px[order]))
-        while len(frames) > _MIN_FRAMES and t_ns - frames[0][0] > _WINDOW_NS + _WINDOW_NS // 16:
+        while len(frames) > MIN_FRAMES and t_ns - frames[0][0] > _WINDOW_NS + _WINDOW_NS // 16:
             _, ids, pixels = frames.popleft()
             if self.resting:
                 steady = ~np.isin(ids, self._unsteady)
@@ -76,7 +74,7 @@ class Stillness:
 
     def _times_limit(self, t_ns: int) -> float:
         """Return the largest motion over the window in units of its limit; infinite where it cannot be told."""
-        if len(self._frames) < _MIN_FRAMES:
+        if len(self._frames) < MIN_FRAMES:
             return np.inf
         if self._is_far():
             return np.inf
@@ -116,7 +114,7 @@ class Stillness:
             places.append(np.full((len(wanted), 2), np.nan))
             places[-1][found] = pixels[at[found]]
         stacked = np.array(places)
-        often = np.isfinite(stacked[..., 0]).sum(axis=0) >= max(_MIN_FRAMES, 0.6 * len(places))
+        often = np.isfinite(stacked[..., 0]).sum(axis=0) >= max(MIN_FRAMES, 0.6 * len(places))
         return wanted[often], np.asarray(stacked[:, often])
 
     def _over_window(self, t_s: Array, ids: NDArray[np.int64], pixels: Array) -> float:
@@ -143,8 +141,8 @@ class Stillness:
         """Return how far the tracks are from their places in units of the limit; 0 where it cannot be told."""
         ids, pixels = self._pixels()
         places, count = self._places.of(ids)
-        now = pixels[-_MIN_FRAMES:]
-        known = (count >= _MIN_FRAMES) & np.isfinite(now[..., 0]).any(axis=0) & ~np.isin(ids, self._unsteady)
+        now = pixels[-MIN_FRAMES:]
+        known = (count >= MIN_FRAMES) & np.isfinite(now[..., 0]).any(axis=0) & ~np.isin(ids, self._unsteady)
         if known.sum() < _MIN_TRACKS:
             return 0.0
         moved = np.nanmean(now[:, known], axis=0) - places[known]

@@ -10,6 +10,7 @@ and Mourikis, "Online temporal calibration for camera-IMU systems", IJRR 2014.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,9 +119,7 @@ class TimeOffset:
         self._t_ns.append(camera_t_ns)
         self._keyframe_ns.append(self._keyframe_t_ns)
         self._rotations.append(np.ascontiguousarray(vo.T_keyframe_body[:3, :3]))
-        old = 0
-        while self._keyframe_ns[old] < camera_t_ns - round(_WINDOW_S * _NS):
-            old += 1
+        old = bisect_left(self._keyframe_ns, camera_t_ns - round(_WINDOW_S * _NS))  # all, after a long hole
         del self._t_ns[:old], self._keyframe_ns[:old], self._rotations[:old]
 
     def wanted_ns(self) -> tuple[int, int] | None:

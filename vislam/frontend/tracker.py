@@ -8,8 +8,6 @@ A frame may bring points that were followed elsewhere (`Frame.tracks`). Then tho
 Lucas-Kanade, and keep their ids; once such a track has been dropped it is not taken up again under the same id.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

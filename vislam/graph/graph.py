@@ -1,7 +1,5 @@
 """Graph: poses, landmarks and what was measured between them, by hand."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 

@@ -82,24 +82,15 @@ class Waiting:
         return joined
 
     def place(
-        self,
-        submaps: Submaps,
-        poses: Array,
-        known: RelativeCovariance,
-        tie: RelativeCovariance | None = None,
-        repeats_m: Callable[[], float] = lambda: np.inf,
+        self, submaps: Submaps, poses: Array, known: RelativeCovariance, tie: RelativeCovariance | None = None
     ) -> Placement | None:
         """Return where the newer of two groups belongs, if enough of its loops agree on that; those wait no longer.
 
         Loops that contradict the tie between two groups wait, and so do all while one speaks for another place that
         the tie does not exclude either: a wall of equal panels fits one panel further as well.
 
-        Args:
-            submaps: of all keyframes.
-            poses: [M, 4, 4] of all keyframes, good within each group.
-            known: gives how good they are.
-            tie: gives how good they are between keyframes of groups that are tied; None: none are.
-            repeats_m: gives how far a place is from the next one that is known to look like it.
+        `poses` [M, 4, 4] are good within each group, as `known` has it, and as `tie` has it between those that are
+        tied; None: none are.
         """
         self.undecided = {}
         pairs = [(submaps.group(e.record.from_id), submaps.group(e.record.to_id)) for e in self._edges]
@@ -114,8 +105,10 @@ class Waiting:
             found = self._place(fitting, ends, known)
             if found is None:
                 continue
-            if rival := self._rival(found, edges, ties, ends, repeats_m()):
+            is_open = len(fitting) - len(found[1]) > _JOIN_MAX_CONTRADICTING * len(fitting)
+            if rival := self._rival(found, edges, ties, ends, np.inf if is_open else 0.0):
                 self.undecided[pair[1]] = rival
+            if rival or is_open:
                 continue
             self._edges = [e for e in self._edges if all(e is not other for other in found[1])]
             return Placement(pair[1], *found)
@@ -126,24 +119,18 @@ class Waiting:
         return edge.chi2(*ends.of(edge, np.eye(4)), tie) < _TIE_LIMIT
 
     def _rival(
-        self,
-        found: tuple[Array, list[LoopModel]],
-        edges: list[LoopModel],
-        ties: dict[int, Array],
-        ends: _Ends,
-        repeats_m: float,
-    ) -> str:
+        self, found: tuple[Array, list[LoopModel]], edges: list[LoopModel], ties: dict[int, Array], ends: _Ends,
+        reach_m: float,
+    ) -> str:  # fmt: skip
         """Return which other place is within reach of the tie, or that too few frames agree on this one; else nothing.
 
+        `reach_m` is that where nothing ties.
         The farther the tie reaches the more frames have to agree: to each of them another panel may look most alike.
         """
         T, agreeing = found
         sigmas_m = [np.sqrt(np.linalg.eigvalsh(ties[e.record.id][3:, 3:])[-1]) for e in agreeing if e.record.id in ties]
-        alike = f"places that are {repeats_m:.1f} m apart look alike here"
-        if not sigmas_m:
-            return alike if np.isfinite(repeats_m) else ""
-        reach_m = _REACH_SIGMAS * min(sigmas_m)
-        need = JOIN_FRAMES + sum(reach_m > step_m for step_m in _FRAME_REACH_M)
+        reach_m = _REACH_SIGMAS * min(sigmas_m) if sigmas_m else reach_m
+        need = JOIN_FRAMES + sum(reach_m > step_m for step_m in _FRAME_REACH_M if sigmas_m)
         if len({e.record.to_id for e in agreeing}) < need:
             return f"{need} frames have to agree on a place, as it may be {reach_m:.1f} m from where habit has it"
         for e in edges:
@@ -151,12 +138,12 @@ class Waiting:
                 off_m = float(np.linalg.norm(e.residual(*ends.of(e, T))[0][3:]))
                 if off_m < reach_m:
                     return f"keyframe {_places(agreeing[0])}, or {off_m:.1f} m from there, as {_places(e)}"
-        return alike if repeats_m < reach_m else ""
+        return ""
 
     def _place(
         self, edges: list[LoopModel], ends: _Ends, known: RelativeCovariance
     ) -> tuple[Array, list[LoopModel]] | None:
-        """Return the motion with the most witnesses, and those, if they are enough and few contradict."""
+        """Return the motion with the most witnesses, and those, if they are enough."""
         best: tuple[Array, list[LoopModel]] | None = None
         metric = [e for e in edges if e.record.has_scale]
         for edge in metric:
@@ -166,10 +153,7 @@ class Waiting:
                 best = T, agreeing
         if not metric:
             best = self._place_by_directions(edges, ends)
-        if best is None or len({e.record.to_id for e in best[1]}) < JOIN_FRAMES:
-            return None
-        contradicting = len(edges) - len(best[1])
-        return best if contradicting <= _JOIN_MAX_CONTRADICTING * len(edges) else None
+        return None if best is None or len({e.record.to_id for e in best[1]}) < JOIN_FRAMES else best
 
     def _agree(self, one: LoopModel, other: LoopModel, T: Array, ends: _Ends, known: RelativeCovariance) -> bool:
         """Return whether a loop fits where another one, which asks for the motion `T`, says that it should."""
@@ -240,14 +224,11 @@ class _Ends:
         A, b = np.zeros((3, 3)), np.zeros(3)
         for edge in edges:
             older, newer, T = self.poses[edge.record.from_id], self.poses[edge.record.to_id], edge.record.T_from_to
+            moves, turned, ray = self._older_moves(edge), older[:3, :3] @ T[:3, :3], older[:3, :3] @ T[:3, 3]
             if R is None:
-                R = newer[:3, :3] @ (older[:3, :3] @ T[:3, :3]).T
-                R = R if self._older_moves(edge) else R.T
-            eye_older, eye_newer = edge.eye(older), edge.eye(newer)
-            if self._older_moves(edge):
-                ray, still, moving = R @ older[:3, :3] @ T[:3, 3], eye_newer, R @ eye_older
-            else:
-                ray, still, moving = older[:3, :3] @ T[:3, 3], eye_older, R @ eye_newer
+                R = newer[:3, :3] @ turned.T if moves else turned @ newer[:3, :3].T
+            ray = R @ ray if moves else ray
+            still, moving = edge.eye(newer if moves else older), R @ edge.eye(older if moves else newer)
             if np.linalg.norm(ray) < 0.5:  # rotation alone
                 return None
             across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
@@ -307,8 +288,8 @@ class Joining:
     def join(self, touched: list[int], notes: list[str]) -> list[LoopModel]:
         """Join submaps as far as loops between them agree; return those that waited and can be gated now."""
         loops, place = self._loops, self._waiting.place
-        tie, repeats_m = loops.gate.relative_covariance, loops.repeats_m
-        while (found := place(self.submaps, self._estimator.poses, self._known, tie, repeats_m)) is not None:
+        covariances = self._known, loops.gate.relative_covariance
+        while (found := place(self.submaps, self._estimator.poses, *covariances)) is not None:
             touched += [m.record.id for m in found.agreeing]
             self._bring(found, notes)
             witnesses = f"{len(found.agreeing)} loops of {len({m.record.to_id for m in found.agreeing})} frames"

@@ -1,7 +1,5 @@
 """PoseGraph: keyframes, odometry and loops in one iSAM2 graph, whose sole owner it is."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -27,9 +25,9 @@ from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel
 from vislam.factors.sensed import Covariance, Readings
 from vislam.graph.belief import LoopSet
+from vislam.graph.estimate import Ids
 from vislam.graph.estimator import Estimator
 from vislam.graph.joining import Joining, weak_link
-from vislam.graph.published import Published
 from vislam.graph.restore import restored_journal, sort_loops
 from vislam.graph.source import MotionSource, Source, WindowSource
 from vislam.graph.travel import Travel
@@ -38,6 +36,38 @@ from vislam.sensors import Suite
 
 _START_SLACK_NS = 20_000_000  # the initial state must belong to keyframe 0
 _UNKNOWN = (1.0, 1e4)  # variances in rad^2 and m^2 of the motion to a new submap: no loop may be tested against it
+_MOVED_M = 0.001  # poses that moved less are not published again
+_MOVED_DEG = 0.05
+
+
+class Published:
+    """Owns the poses as they were last published, where odom is in map, and the number of the last update."""
+
+    def __init__(self) -> None:
+        """Start with nothing published."""
+        self._poses: Array = np.zeros((0, 4, 4))
+        self.T_map_odom: Array = np.eye(4)
+        self.revision = 0
+
+    def place_odom(self, T_map_body: Array, T_odom_body: Array) -> None:
+        """Take where the newest keyframe is in both."""
+        self.T_map_odom = T_map_body @ invert(np.ascontiguousarray(T_odom_body, dtype=np.float64))
+
+    def take(self, poses: Array, read: Ids, everything: bool) -> Ids:
+        """Return which of the poses [M, 4, 4] that were read back have moved, or all; they count as published now."""
+        known = self._poses
+        ids = np.arange(len(poses), dtype=np.int64) if everything else read
+        if (grown := len(poses) - len(known)) > 0:
+            known = np.concatenate([known, np.full((grown + len(poses) // 2, 4, 4), np.inf)])
+        fresh, old = poses[ids], known[ids]
+        shift = np.linalg.norm(fresh[:, :3, 3] - old[:, :3, 3], axis=1)
+        limit = 2.0 * np.sqrt(2.0) * np.sin(0.5 * np.deg2rad(_MOVED_DEG))  # the chord of that angle
+        chord = np.linalg.norm(fresh[:, :3, :3] - old[:, :3, :3], axis=(1, 2))
+        moved = ids[(shift > _MOVED_M) | (chord > limit) | everything]
+        known[moved] = poses[moved]
+        self._poses = known
+        self.revision += 1
+        return moved
 
 
 class PoseGraph:
@@ -161,11 +191,13 @@ class PoseGraph:
         return GraphRecord(self._said, states, loops, self._loops.take_ties(), self._estimator.vo_scale, own)
 
     def add(
-        self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None
-    ) -> GraphUpdate:
+        self, packet: KeyframePacket, edges: Sequence[LoopEdge] = (), T_odom_body: Array | None = None,
+        undo: Sequence[int] = (),
+    ) -> GraphUpdate:  # fmt: skip
         """Add a keyframe and the loop edges that ended with it; return what changed.
 
         `T_odom_body` [4, 4] is the keyframe's pose in odom, from which T_map_odom follows; without it the last stays.
+        `undo` are ids of loops that a user takes out for good, as far as they are held.
         Raises DataError, and changes nothing, on a packet that cannot be used.
         """
         if self._start is None:
@@ -196,21 +228,19 @@ class PoseGraph:
         self._keyframes.append(record)
         if record.begins_submap:
             self._joining.begin(record.id, record.is_tied)
-            notes.append(
-                f"keyframe {record.id} begins submap {len(self._joining.submaps.groups) - 1} of the trajectory"
-            )
+            notes.append(f"keyframe {record.id} begins submap {len(self._joining.submaps.groups) - 1}")
         self._T_odom_last = T_odom_body
-        accepted, refused = self._close(edges, notes)
+        accepted, refused = self._close(edges, undo, notes)
         if T_odom_body is not None:
             self._published.place_odom(self._estimator.poses[-1], T_odom_body)
         return self._publish(accepted, refused, "; ".join(n for n in notes if n))
 
-    def finish(self) -> GraphUpdate:
-        """Iterate to convergence and return all poses; the note tells the cost and how it was reached."""
+    def finish(self, undo: Sequence[int] = ()) -> GraphUpdate:
+        """Iterate to convergence and return all poses; the note tells cost and way. `undo` as for `add`."""
         if not self._keyframes:
             return GraphUpdate(self._published.revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
         before, notes = self._estimator.poses[-1].copy(), list[str]()
-        decided = self._loops.finish(notes)
+        decided = self._loops.undo(undo, notes) + self._loops.finish(notes)
         notes.append(self._estimator.converge())
         self._published.T_map_odom = self._estimator.poses[-1] @ invert(before) @ self._published.T_map_odom
         return self._publish(*self._loops.ledger.split(decided), "; ".join(n for n in notes if n), everything=True)
@@ -257,9 +287,9 @@ class PoseGraph:
         """Return what became of every offered loop, by loop id, with the weight it has now."""
         return self._loops.reports()
 
-    def _close(self, edges: Sequence[LoopEdge], notes: list[str]) -> tuple[list[int], list[int]]:
+    def _close(self, edges: Sequence[LoopEdge], undo: Sequence[int], notes: list[str]) -> tuple[list[int], list[int]]:
         """Gate loops, accept them or keep them pending, and let the review work; return accepted and refused ids."""
-        here, touched = list[LoopModel](), list[int]()
+        here, touched = list[LoopModel](), self._loops.undo(undo, notes)
         self._estimator.look_at([k for e in edges for k in (e.from_id, e.to_id) if 0 <= k < len(self._keyframes)])
         for edge in edges:
             model = self._loops.admit(edge, len(self._keyframes) - 1)

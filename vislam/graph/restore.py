@@ -1,7 +1,5 @@
 """An earlier run's graph as records again: what a session stored, checked, in the order in which it came."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from vislam.config import GraphConfig

@@ -1,7 +1,5 @@
 """What feeds the graph between loops: measured motions (loose coupling) or a sliding window (tight coupling)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol

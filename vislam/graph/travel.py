@@ -1,7 +1,5 @@
 """Odometry from keyframe to keyframe, kept free of what loops made of it: how far, and how uncertain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

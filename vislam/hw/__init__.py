@@ -8,14 +8,17 @@ from vislam.core.late import late
 
 if TYPE_CHECKING:
     from vislam.hw.health import Health
+    from vislam.hw.port_readings import PortReadings
 
 __all__ = [
     "Health",
+    "PortReadings",
 ]
 
 __getattr__ = late(
     __name__,
     {
         "Health": "vislam.hw.health",
+        "PortReadings": "vislam.hw.port_readings",
     },
 )

@@ -1,7 +1,5 @@
 """One inertial sample for each of the gyro's, from sensors that stamp each for itself."""
 
-from __future__ import annotations
-
 from collections import deque
 
 from vislam.core.messages import Array

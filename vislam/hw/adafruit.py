@@ -1,7 +1,5 @@
 """Any object of an `adafruit_*` driver that has `acceleration` and `gyro` as a source of inertial samples."""
 
-from __future__ import annotations
-
 import importlib
 from collections import Counter
 from collections.abc import Callable

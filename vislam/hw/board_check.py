@@ -1,7 +1,5 @@
 """Whether a board that stands still measures what the world has: gravity, no rotation, the earth's field."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The magnetometer of a board: found, polled at its rate, judged, and turned into samples of the body's axes."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """From values in SI units to calibrated samples, for sources that bring units of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Waiting for the bytes of devices and sockets. `select`, and pyserial's `read`, fail from the 1024th open file on."""
 
-from __future__ import annotations
-
 import os
 from select import POLLIN, poll
 

@@ -1,7 +1,5 @@
 """A board whose inertial chip has a FIFO: clock, stamps, faults and reconnection for every chip of `hw.chips.imus`."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 
@@ -22,17 +20,47 @@ from vislam.hw.chips import (
     lsm6dsox,
     mpu6050,
 )
+from vislam.hw.chips.fifo_imu import G_M_S2
 from vislam.hw.chips.magnetometer import find_any_magnetometer
 from vislam.hw.fifo_samples import FifoSamples
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 from vislam.hw.link import ChipLinks, Link, refuse_shared
-from vislam.hw.scale_test import force_at_rest, scale_test
 from vislam.hw.timing import Clock, HostClock, read_in_rounds
 
 _NS = 1_000_000_000
 _WATCH_S = 0.5  # between looks at temperature and settings
 _ASKED_PER_SAMPLE = 1.07  # no whole number: questions then sweep over the samples' phase, which narrows their times
+TOLERANCE_M_S2 = 1.0  # zero of an MPU-6050 out of the box: 0.8 m/s^2; a wrong range is off by half
+_SAMPLES, _MOST_PERIODS = 20, 80
+_MAX_STD_M_S2 = 0.3  # it moved
+
+
+def force_at_rest(imu: FifoImu, clock: Clock) -> float | None:
+    """Return what a chip measures of gravity (m/s^2); None where it moves or its samples do not come, in 80 periods.
+
+    Its FIFO must be emptied afterwards. Raises BusError.
+    """
+    period_ns = round(1e9 / imu.rate_hz)
+    clock.sleep_until(clock.now_ns() + round(imu.start_up_s * 1e9))
+    imu.empty()
+    counts = np.zeros((0, 3))
+    for _ in range(_MOST_PERIODS // 8):
+        clock.sleep_until(clock.now_ns() + 8 * period_ns)
+        counts = np.vstack([counts, imu.take(imu.waiting().units).accel])
+        if len(counts) >= _SAMPLES:
+            forces = counts * imu.accel_m_s2
+            return None if forces.std(axis=0).max() > _MAX_STD_M_S2 else float(np.linalg.norm(forces.mean(axis=0)))
+    return None
+
+
+def scale_test(imu: FifoImu, force_m_s2: float | None) -> SelfTest:
+    """Return whether a force at rest is gravity."""
+    if force_m_s2 is None:
+        return SelfTest(imu.name, None, f"{imu.doubt}; its scale is not known to fit: start it at rest", (0.0,))
+    passed = abs(force_m_s2 - G_M_S2) <= TOLERANCE_M_S2
+    what = f"gravity is {force_m_s2:.2f} m/s^2 by its scale, {G_M_S2:.2f} within {TOLERANCE_M_S2:g} expected"
+    return SelfTest(imu.name, passed, f"{imu.doubt}; {what}", (force_m_s2,))
 
 
 class FifoBoard:

@@ -1,7 +1,5 @@
 """The temperature at which a gyro's biases were taken, and how they go on from there."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The health word: what the controller must know before it trusts a pose, as bits that travel in every datagram."""
 
-from __future__ import annotations
-
 from enum import IntFlag
 
 

@@ -1,7 +1,5 @@
 """An inertial chip that the kernel drives, through its Industrial I/O buffers: stamped by the kernel."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from pathlib import Path

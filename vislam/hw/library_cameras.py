@@ -46,9 +46,12 @@ def open_image_camera(name: str, config: SensorsConfig, must_be_there: bool = Tr
 
     Raises HardwareError when its package is not installed or, where it must be there, the camera is missing.
     """
-    from vislam.hw.cameras.picam import open_picam
+    from vislam.hw.cameras.library_camera import LibraryCamera
+    from vislam.hw.cameras.picam import PicamStream, camera_number, picamera2
 
-    return open_picam(_picam(name, config), must_be_there)
+    settings = _picam(name, config)
+    picamera2()
+    return LibraryCamera(f"picam:{camera_number(settings)}", lambda: PicamStream(settings), settings, must_be_there)
 
 
 def open_frame_camera(
@@ -58,14 +61,21 @@ def open_frame_camera(
 
     Raises as `open_image_camera` does, and UsageError for a wrong option.
     """
-    with_depth = has_depth(name)
-    if _kind(name) == "oak":
-        from vislam.hw.cameras.oak import open_oak
+    from vislam.hw.cameras.library_camera import LibraryCamera
 
-        return open_oak(_oak(name, config), must_be_there, with_depth, imu)
-    from vislam.hw.cameras.realsense import open_realsense
+    with_depth, kind = has_depth(name), _kind(name)
+    shown = f"{kind},{_DEPTH}" if with_depth else kind
+    if kind == "oak":
+        from vislam.hw.cameras.oak import OakStream, depthai
 
-    return open_realsense(_realsense(name, config), with_depth, must_be_there, imu)
+        oak = _oak(name, config)
+        depthai()
+        return LibraryCamera(shown, lambda: OakStream(oak, with_depth, imu), oak, must_be_there)
+    from vislam.hw.cameras.realsense import RealsenseStream, pyrealsense2
+
+    realsense = _realsense(name, config)
+    pyrealsense2()
+    return LibraryCamera(shown, lambda: RealsenseStream(realsense, with_depth, imu), realsense, must_be_there)
 
 
 def reads_own_imu(inertial: str, camera: str) -> bool:

@@ -1,7 +1,5 @@
 """How a board stands with its bus and its chips: which are up, what failed, what is set up again and when."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The IMU inside a camera: threads of the device put samples in, the reader of inertial samples takes them."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, deque

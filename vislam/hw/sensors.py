@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from vislam.hw.cameras.library_camera import LibraryCamera
     from vislam.hw.cameras.video import VideoCamera
-    from vislam.hw.cameras.webcam import Webcam
     from vislam.hw.source import CapturedImage, InertialSource
 
 # chips with a FIFO as a command line names them, and the family of each as the settings do; board: whichever answers
@@ -107,7 +106,7 @@ def open_camera(
     must_be_there: bool = True,
     stamps_ns: Sequence[int] | None = None,
     in_real_time: bool = True,
-) -> Webcam | VideoCamera | LibraryCamera[CapturedImage]:
+) -> VideoCamera | LibraryCamera[CapturedImage]:
     """Open a camera by its index or device file, `webcam` as in the settings, `picam`, or a video in its place.
 
     Raises HardwareError when it is missing and must be there.
@@ -167,17 +166,12 @@ def is_video(name: str) -> bool:
 
 def with_raw_samples(config: SensorsConfig) -> SensorsConfig:
     """Return the settings with which sensors give raw samples: turned into body axes and nothing else."""
-
-    def raw(calibration: SensorCalibration) -> SensorCalibration:
-        c = calibration
-        return SensorCalibration(gyro_axes=c.gyro_axes, accel_axes=c.accel_axes, mag_axes=c.mag_axes)
-
-    gy85 = replace(config.gy85, calibration=raw(config.gy85.calibration))
-    serial = replace(config.serial, calibration=raw(config.serial.calibration))
-    board = replace(config.board, calibration=raw(config.board.calibration))
-    realsense = replace(config.realsense, calibration=raw(config.realsense.calibration))
-    oak = replace(config.oak, calibration=raw(config.oak.calibration))
-    return replace(config, gy85=gy85, serial=serial, board=board, realsense=realsense, oak=oak)
+    raw = {}
+    for section in ("gy85", "serial", "board", "realsense", "oak"):
+        c = getattr(config, section).calibration
+        turned = SensorCalibration(gyro_axes=c.gyro_axes, accel_axes=c.accel_axes, mag_axes=c.mag_axes)
+        raw[section] = replace(getattr(config, section), calibration=turned)
+    return replace(config, **raw)
 
 
 def calibration_of(name: str, config: SensorsConfig) -> SensorCalibration:

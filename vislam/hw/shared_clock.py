@@ -1,7 +1,5 @@
 """The clock of a device with an IMU and cameras, put on the host's: one line for all that it stamps."""
 
-from __future__ import annotations
-
 import threading
 from bisect import bisect_left
 from collections import deque

@@ -1,12 +1,12 @@
 """What the live driver asks of a sensor: read with a limit on waiting, a health word, close."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
-from vislam.core.messages import Array, ImageU8, ImuSample, MagSample
+from vislam.core.messages import Array, Frame, ImageU8, ImuSample, MagSample
+from vislam.core.readings import Reading
 from vislam.hw.health import Health
+from vislam.sensors.geodetic import Geodetic
 
 
 class InertialSource(Protocol):
@@ -56,11 +56,14 @@ class CapturedImage:
     image: ImageU8  # [H, W] or [H, W, 3] BGR
 
 
-class ImageSource(Protocol):
-    """A camera that keeps its newest image only."""
+Shot_co = TypeVar("Shot_co", CapturedImage, Frame, covariant=True)
 
-    def read(self, timeout_s: float) -> CapturedImage | None:
-        """Return the newest image not yet returned, waiting at most `timeout_s`; None if none came."""
+
+class ShotSource(Protocol[Shot_co]):
+    """A camera, or the cameras of a rig, that keep their newest shot only; gaps in its index count what was dropped."""
+
+    def read(self, timeout_s: float) -> Shot_co | None:
+        """Return the newest shot not yet returned, waiting at most `timeout_s`; None if none came."""
         ...
 
     def health(self) -> Health:
@@ -68,9 +71,37 @@ class ImageSource(Protocol):
         ...
 
     def counters(self) -> dict[str, int]:
-        """Return images captured, dropped as too old, and faults since the start."""
+        """Return shots captured, dropped as too old, and faults since the start."""
         ...
 
     def close(self) -> None:
         """Give the device back; may be called twice."""
+        ...
+
+
+ImageSource = ShotSource[CapturedImage]
+FrameSource = ShotSource[Frame]
+
+
+class ReadingSource(Protocol):
+    """Sensors that are read beside the camera; nothing here may wait."""
+
+    def read(self) -> list[Reading]:
+        """Return the readings that came since the last call, at once, stamped by CLOCK_MONOTONIC."""
+        ...
+
+    def status(self) -> dict[str, str]:
+        """Return by sensor "well", or its problem."""
+        ...
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return by sensor how many readings came, and how often each fault occurred."""
+        ...
+
+    def datums(self) -> dict[str, Geodetic]:
+        """Return by receiver where its frame begins, as far as it has reported."""
+        ...
+
+    def close(self) -> None:
+        """Give all devices back; may be called twice."""
         ...

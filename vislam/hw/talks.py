@@ -1,6 +1,7 @@
-"""What devices say, as readings: satellite receivers, lines of numbers, and counts of encoders."""
+"""What devices say, as readings: satellite receivers, lines of numbers, and counts of encoders.
 
-from __future__ import annotations
+Receivers talk in bursts, one per fix. What they say of UTC is no time of this machine; when they begin to talk is.
+"""
 
 import math
 import re
@@ -15,9 +16,8 @@ import numpy as np
 from vislam.config import BridgeClockConfig
 from vislam.core.readings import Reading
 from vislam.hw.bridge.clock import DeviceClock
-from vislam.hw.gnss_stream import FixStream, NmeaStream, UbxStream
 from vislam.sensors.geodetic import Geodetic
-from vislam.sensors.gnss import Fix, FixReadings
+from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
 from vislam.sensors.ticks import TickSpeeds, TicksSettings
 from vislam.sensors.toml import SensorPort
 
@@ -26,6 +26,90 @@ _OLD_NS = 3 * _NS  # without a reading for so long, a device is said to have non
 _MOST_LINE_BYTES = 1024
 _BETWEEN = re.compile(rb"[,;\s]+")
 _MICROSECONDS = 2**32
+_TIMED = ("GGA", "RMC", "GST")
+
+
+class NmeaStream:
+    """Lines of NMEA 0183 as fixes; a gap ends a burst."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self.damaged = 0
+        self._fixes = NmeaFixes()
+        self._rest = b""
+        self._line_ns = 0  # when the first byte of `_rest` came
+        self._burst_ns: int | None = None  # when the first byte of the burst came, while no sentence had a time
+        self._begins_burst = True
+        self._time, self._stamp_ns = "", 0  # of the fix that is collected
+
+    def feed(self, data: bytes, arrival_ns: int) -> list[Fix]:
+        """Return the fixes that bytes, which came at a time of CLOCK_MONOTONIC, end by a sentence of another time."""
+        if self._begins_burst:
+            self._begins_burst, self._burst_ns = False, arrival_ns
+        found = []
+        for piece in data.splitlines(keepends=True):
+            if not self._rest:
+                self._line_ns = arrival_ns
+            self._rest += piece
+            if not self._rest.endswith((b"\n", b"\r")):
+                if len(self._rest) > _MOST_LINE_BYTES:  # another rate, or another device
+                    self._rest = b""
+                    self.damaged += 1
+                continue
+            line, self._rest = self._rest.strip(), b""
+            fix = self._sentence(line.decode("ascii", errors="replace")) if line else None
+            if fix is not None:
+                found.append(fix)
+        return found
+
+    def end_burst(self) -> list[Fix]:
+        """Return the fix that is complete because nothing more came."""
+        self._begins_burst = True
+        fix = self._fixes.end()
+        return [] if fix is None else [fix]
+
+    def _sentence(self, line: str) -> Fix | None:
+        sentence = line[line.find("$") :]
+        before = self._time, self._stamp_ns, self._burst_ns
+        time = sentence.split(",")[1] if sentence[3:6] in _TIMED and "," in sentence else ""
+        if time and time != self._time:
+            self._time, self._stamp_ns = time, self._line_ns if self._burst_ns is None else self._burst_ns
+            self._burst_ns = None
+        try:
+            return self._fixes.feed(f"{self._stamp_ns} {sentence}")
+        except ValueError:
+            self.damaged += 1
+            self._time, self._stamp_ns, self._burst_ns = before
+            return None
+
+
+class UbxStream:
+    """u-blox's binary messages as fixes; a gap ends a burst."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._fixes = UbxFixes()
+        self._burst_ns: int | None = None  # when the first byte after a gap or a fix came
+
+    @property
+    def damaged(self) -> int:
+        """Messages that could not be read."""
+        return self._fixes.damaged
+
+    def feed(self, data: bytes, arrival_ns: int) -> list[Fix]:
+        """Return the fixes that are complete with these bytes, which came at a time of CLOCK_MONOTONIC."""
+        if self._burst_ns is None:
+            self._burst_ns = arrival_ns
+        found = []
+        for fix in self._fixes.feed(data):
+            found.append(replace(fix, t_ns=arrival_ns if self._burst_ns is None else self._burst_ns))
+            self._burst_ns = None
+        return found
+
+    def end_burst(self) -> list[Fix]:
+        """Return nothing: messages have their length."""
+        self._burst_ns = None
+        return []
 
 
 class Talk(Protocol):
@@ -122,7 +206,7 @@ class FixTalk:
         """See `Talk`."""
         return {**self._tally.counts, "damaged": self._damaged + self._stream.damaged}
 
-    def _new_stream(self) -> FixStream:
+    def _new_stream(self) -> NmeaStream | UbxStream:
         return UbxStream() if self._config.format == "ubx" else NmeaStream()
 
     def _made(self, fix: Fix) -> Iterator[Reading]:

@@ -1,7 +1,5 @@
 """Time as sensors see it: the host's clock, and the times of samples that a chip takes by a clock of its own."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Protocol, TypeVar

@@ -1,7 +1,5 @@
 """Attitude without vision: the baseline that vision has to beat. What an estimator integrates is not filtered here."""
 
-from __future__ import annotations
-
 from math import isfinite
 
 import numpy as np

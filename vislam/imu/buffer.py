@@ -1,7 +1,5 @@
 """The last seconds of inertial data, from which spans between frames are cut."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +12,7 @@ from vislam.imu.noise_floor import NoiseFloor
 from vislam.imu.series import ImuSeries
 
 _NS = 1_000_000_000
+_FORGOTTEN_NS = _NS  # after which a body may have turned any way
 
 
 class ImuBuffer:
@@ -56,7 +55,14 @@ class ImuBuffer:
     @property
     def events(self) -> list[StreamEvent]:
         """What happened in the stream so far."""
-        return [*self._series.judge.events, *(event for _, event in self._disbelieved)]
+        known = self._series.judge.events
+        bursts_ns = [event.from_ns for event in known if event.happening is Happening.BURST]
+        return [*known, *(event for after_ns, event in self._disbelieved if after_ns not in bursts_ns)]
+
+    def burst_ns(self, t_ns: int) -> int | None:
+        """Return after which time samples came in bursts, up to half a second before `t_ns`; None: they did not."""
+        bursts = (e for e in self._series.judge.events if e.happening is Happening.BURST and t_ns - e.to_ns < _NS // 2)
+        return next((event.from_ns for event in bursts), None)
 
     def believe(self, until_ns: int | None, since_ns: int) -> None:
         """Take samples after `until_ns` for no information, None: those that come from now on are some again.
@@ -98,6 +104,16 @@ class ImuBuffer:
     def as_felt(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
         """Return the samples of `[t0_ns, t1_ns]`, believed or not; None where there is a hole."""
         return None if self._longest_ns(t0_ns, t1_ns) > self._max_gap_ns else self._series.cut(t0_ns, t1_ns)
+
+    def after_hole(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
+        """Return the samples up to `t1_ns` since a hole of which a second or more lies in `[t0_ns, t1_ns]`; None: none.
+
+        None as well while there are not two of them.
+        """
+        times = self._series.t_ns
+        times = times[max(int(np.searchsorted(times, t0_ns)) - 1, 0) : np.searchsorted(times, t1_ns, side="right")]
+        ends = np.flatnonzero(times[1:] - np.maximum(times[:-1], t0_ns) > _FORGOTTEN_NS) + 1
+        return self.span(int(times[ends[-1]]), t1_ns) if len(ends) and ends[-1] + 1 < len(times) else None
 
     def unbroken(self, t0_ns: int, t1_ns: int) -> ImuSpan | None:
         """Return `span`, or None, and count it, where a hole in it is longer than `machine.max_gap_s`."""

@@ -1,7 +1,5 @@
 """How an inertial unit is doing, beside its noise: its rate, holes, a range that ends too early, the force it feels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,6 +13,7 @@ from vislam.imu.series import AXES
 _NS = 1_000_000_000
 _WINDOW, _AGAIN = 256, 96  # samples looked at together, and how many of them again in the next window
 _HOLE = 2.5  # usual intervals; a longer one is a hole
+_TOGETHER = 0.25  # of the mean interval: with a shorter usual one, samples come in bursts
 _COARSE_STEPS = 8.0  # of the sensor's resolution
 _AXES = [axis.name for axis in AXES]
 _BY_CHANCE = 1e-3  # plateaus at the end of the range that chance would make in the whole recording
@@ -79,7 +78,8 @@ class ConditionWatch:
 
     def _look(self, t_ns: NDArray[np.int64], values: Array) -> None:
         """Take times [N] and values [N, 6] of a window that begins within the one before."""
-        self._intervals_ns.append(int(np.median(np.diff(t_ns))))
+        usual_ns, mean_ns = float(np.median(np.diff(t_ns))), float(np.mean(np.diff(t_ns)))
+        self._intervals_ns.append(int(usual_ns if usual_ns > _TOGETHER * mean_ns else mean_ns))
         self._forces.append(float(np.linalg.norm(values[:, 3:].mean(axis=0))))
         changes = np.abs(np.diff(values, axis=0))
         self._equal += np.sum(changes == 0.0, axis=0)

@@ -10,8 +10,6 @@ Errors of scale factor and misalignment are no noise either, but grow with motio
 variance v, most of it near the frequency f at which bodies move, has the density s^2 v / (2 f) there.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import pairwise

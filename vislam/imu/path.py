@@ -1,7 +1,5 @@
 """What a whole recording of inertial samples shows of a body's path: attitude and position, integrated."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline

@@ -3,8 +3,6 @@
 Karpov 2026, section 2. It is refused while the cart moves, for a wrong zero would stay wrong for the whole drive.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

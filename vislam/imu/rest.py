@@ -1,7 +1,5 @@
 """Rest detection from inertial statistics; the caller combines it with what the image shows."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

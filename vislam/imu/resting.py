@@ -1,7 +1,5 @@
 """The first state from rest: gravity and gyro bias are the means of what the IMU measures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inertial samples in contiguous memory: appended at the end, forgotten at the front, cut anywhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise

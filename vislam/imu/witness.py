@@ -7,8 +7,6 @@ on unbroken. Which of the two is wrong shows in the tracks: a camera that follow
 good samples, after many tracks did not agree with the others; bad samples come while the tracks agree as ever.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -122,6 +120,12 @@ class MotionWitness:
             force = interpolate(last.T_vo_body, T_vo_body, 0.5)[:3, :3] @ span.accel_m_s2.mean(axis=0)
             self._frames.append(_Seen(vo.t_ns, T_vo_body, gyro_rotation(span), force))
             self._compare(vo.has_scale)
+
+    def doubt(self, until_ns: int, t_ns: int) -> None:
+        """Disbelieve samples after a time, as what is known of their stamps at `t_ns` asks for."""
+        if self.until_ns is None:
+            self.until_ns, self.since_ns = until_ns, until_ns + 1
+        self.doubted_ns, self._against_s = t_ns, max(self._against_s, _ENOUGH_S)
 
     @property
     def doubts(self) -> bool:

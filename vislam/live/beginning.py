@@ -1,7 +1,5 @@
 """What a live run goes on from: the map of another session, or what it was itself when it ended."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path

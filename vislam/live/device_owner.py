@@ -1,7 +1,5 @@
 """The process that owns a camera with an IMU inside: such a device can be opened once, and two processes want it."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import threading

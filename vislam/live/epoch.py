@@ -1,7 +1,5 @@
 """The moment at which something played back, or simulated, begins: one for all processes of a run."""
 
-from __future__ import annotations
-
 import signal
 import time
 from multiprocessing import get_context

@@ -5,8 +5,6 @@ and as the answer of a filter depends on the set of measurements only, not on wh
 `odom` is one frame in all processes, and no state has to be sent around.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from typing import Any

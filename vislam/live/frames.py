@@ -1,35 +1,12 @@
 """A camera as the front process sees it: the newest frame, or none."""
 
-from __future__ import annotations
-
 import time
-from typing import Protocol
 
 import cv2
 
 from vislam.core.messages import Frame
 from vislam.hw.health import Health
 from vislam.hw.source import ImageSource
-
-
-class FrameSource(Protocol):
-    """Cameras of a rig that keep their newest frame only; gaps in the frame's index count what was dropped."""
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """Return the newest frame not yet returned, waiting at most `timeout_s`; None if none came."""
-        ...
-
-    def health(self) -> Health:
-        """Return CAMERA_MISSING or nothing."""
-        ...
-
-    def counters(self) -> dict[str, int]:
-        """Return frames captured, dropped as too old, and faults since the start."""
-        ...
-
-    def close(self) -> None:
-        """Give the device back; may be called twice."""
-        ...
 
 
 class OneCamera:

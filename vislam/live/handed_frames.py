@@ -1,7 +1,5 @@
 """Frames of a device that another process owns, through shared memory: the newest one, and how the camera is."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time

@@ -1,7 +1,5 @@
 """Inertial samples of a device that another process owns: it sends them, the fast process reads. Loads no OpenCV."""
 
-from __future__ import annotations
-
 import json
 import select
 import socket

@@ -1,7 +1,5 @@
 """What goes from the front and the back process to the map process, and from the front to the back."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

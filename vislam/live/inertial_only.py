@@ -1,7 +1,5 @@
 """What a cart knows without its camera: the zero of power-up, attitude from there on, a watch on the magnetic field."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import asdict
 from typing import Any

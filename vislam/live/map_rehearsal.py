@@ -1,7 +1,5 @@
 """The map process's part of a rehearsal: map, viewer and what is written at the end, of a made-up wall."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path

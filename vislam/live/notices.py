@@ -1,8 +1,9 @@
 """Messages between the processes, beside measurements. Plain values; nothing here loads a heavy package."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from vislam.core.messages import Array, NavState, NoiseScale, VoMeasurement
 from vislam.ekf.correction import AppliedReading, Correction
@@ -53,6 +54,17 @@ class MapMoved:
     revision: int
     T_map_odom: Array  # [4, 4]
     is_in_map: bool = True  # its submap is joined with the map; else T_map_odom is a guess
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapCells:
+    """The drive grid of the map as it is now, see `DriveGrid`; row 0 is at the lowest y."""
+
+    states: NDArray[np.int8]  # [rows, columns] above 0: the cart cannot drive there; 0 free, -1 not seen
+    resolution_m: float
+    origin_m: tuple[float, float]  # x, y of the lower-left corner, in the map frame
+    floor_m: float
+    body_m: tuple[float, float]  # length and width of the cart
 
 
 ToFast = Start | Correction | AppliedReading | Rebase | CameraHealth | Doubted | MapMoved

@@ -5,8 +5,6 @@ that inertial samples and the back end need. So frames are left out evenly befor
 The map follows behind a queue: so that it is never far behind, it takes fewer keyframes.
 """
 
-from __future__ import annotations
-
 from statistics import median
 
 from vislam.core.messages import Frame, ImuSample

@@ -1,48 +1,22 @@
 """Further sensors of a live run, as the front process sees them: readings that have come, and how each sensor is."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from vislam.config import FurtherSensorsConfig
 from vislam.core.errors import UsageError
 from vislam.core.readings import Reading
+from vislam.hw.port_readings import PortReadings
+from vislam.hw.source import ReadingSource
 from vislam.live.epoch import Epoch
-from vislam.live.port_readings import PortReadings
 from vislam.sensors import SensorSetup, Suite, load_sensor_setup
 from vislam.sensors.geodetic import Geodetic
 
 _MISSING_S = 2.0  # without a reading for so long, a sensor is said to be silent
-
-
-class ReadingSource(Protocol):
-    """Sensors that are read beside the camera, in the front process; nothing here may wait."""
-
-    def read(self) -> list[Reading]:
-        """Return the readings that have come since the last call, stamped by CLOCK_MONOTONIC."""
-        ...
-
-    def status(self) -> dict[str, str]:
-        """Return in a word how each sensor is: "well", or its problem."""
-        ...
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """Return by sensor how many readings came, and how often each fault occurred."""
-        ...
-
-    def datums(self) -> dict[str, Geodetic]:
-        """Return by sensor where on the earth its frame begins, as far as a receiver has reported it by now."""
-        ...
-
-    def close(self) -> None:
-        """Give all devices back; may be called twice."""
-        ...
 
 
 def live_readings(

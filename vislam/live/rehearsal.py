@@ -1,7 +1,5 @@
 """A few made-up frames through stages that are then thrown away: what is compiled is compiled before it counts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from math import sin

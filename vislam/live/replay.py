@@ -1,7 +1,5 @@
 """A recording in real time, as if its sensors were plugged in: for trying out settings, and for tests."""
 
-from __future__ import annotations
-
 import heapq
 import time
 from array import array
@@ -17,10 +15,11 @@ from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.core.recording import Recording
 from vislam.hw.health import Health
+from vislam.hw.source import FrameSource, ReadingSource
 from vislam.live.epoch import Epoch
-from vislam.live.frames import FrameSource, NoCamera
+from vislam.live.frames import NoCamera
 from vislam.live.processes.child import Life
-from vislam.live.reading_source import ReadingSource, ReplayedReadings, refuse_unread
+from vislam.live.reading_source import ReplayedReadings, refuse_unread
 from vislam.live.replayed_imu import InertialTable, ReplayedImu
 from vislam.runs.further_sensors import FurtherReadings
 from vislam.runs.sources import open_source

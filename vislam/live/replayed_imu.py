@@ -1,7 +1,5 @@
 """Inertial samples of a recording in real time. Apart from the frames: the fast process loads no OpenCV."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A live run: starts the processes, watches over them, and ends them together."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import time
@@ -9,26 +7,28 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from multiprocessing import connection, get_context
+from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from vislam.config import Config
+import numpy as np
+
+from vislam.config import Config, PowerUpConfig
 from vislam.core import interrupts
-from vislam.core.errors import HardwareError, UsageError, VislamError
+from vislam.core.errors import HardwareError, StorageError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.recording import Recording
-from vislam.hw.source import InertialSource
+from vislam.hw.source import FrameSource, InertialSource, ReadingSource
+from vislam.imu import BiasMemory
 from vislam.live.beginning import Beginning
 from vislam.live.bridges import translator
-from vislam.live.frames import FrameSource
-from vislam.live.kept_bias import KeptBias
 from vislam.live.processes import back as back_process
 from vislam.live.processes import fast as fast_process
 from vislam.live.processes import front as front_process
 from vislam.live.processes import map as map_process
 from vislam.live.processes.child import Child, Failure, Flag, Life, Note, Ready, Signals, measured
-from vislam.live.reading_source import ReadingSource, live_readings
+from vislam.live.reading_source import live_readings
 from vislam.live.web.updates import WebEnds
 from vislam.live.wire.slot import remove
 from vislam.pipeline.settings import derived
@@ -42,6 +42,36 @@ _WATCH_S = 0.1
 _WRITERS = ("fast", "front", "back", "map")
 _BRIEF_S = 1.3  # after a signal, that writing down what there is may take
 _AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
+
+
+class KeptBias:
+    """Owns the file of remembered biases; in the parent of all processes, for no sensor waits for a disk.
+
+    Attributes:
+        memory: what earlier runs left.
+        refusal: why the bias of this run is not kept; None: it is, or there was none yet.
+    """
+
+    def __init__(self, config: PowerUpConfig) -> None:
+        """Read the file, where one is asked for; raises DataError when it is damaged."""
+        self._path = None if config.memory is None else Path(config.memory)
+        self.memory = BiasMemory(config.remembered)
+        if self._path is not None:
+            self.memory = BiasMemory.read(self._path, config.remembered)
+        self.refusal: str | None = None
+        self._is_kept = False
+
+    def take(self, report: dict[str, Any]) -> None:
+        """Keep the bias that power-up reports, once, if it found one."""
+        temperature_c = report.get("temperature_c")
+        if self._path is None or self._is_kept or temperature_c is None:
+            return
+        self._is_kept = True
+        self.memory.add(temperature_c, np.array(report["gyro_bias_rad_s"]))
+        try:
+            self.memory.write(self._path)
+        except StorageError as error:
+            self.refusal = str(error)
 
 
 class LiveSource(Recording, Protocol):
@@ -129,6 +159,8 @@ class LiveRun:
         self._children: dict[str, Child] = {}
         self._failure: VislamError | None = None
         self._ends: list[Any] = []  # our copies of wires that belong to children
+        self._drivers: list[Connection] = []  # bring the map to who drives by it
+        self._guesses: list[Connection] = []  # say where they think that they are
         self._bias = KeptBias(config.power_up)
         self._roles = self._wire(source, config, out, asked, command, noise, base, beginning, web)
 
@@ -138,7 +170,8 @@ class LiveRun:
     ) -> dict[str, Callable[[Life], None]]:  # fmt: skip
         """Return what each process does, with its ends of the wires."""
         suite, open_readings = live_readings(config.sensors, source.readings)
-        bridges = translator.asked(config.live, tuple(source.rig.T_body_cams))
+        maps = None if config.live.ros2_domain is None else self._wire_of(self._drivers, 1)
+        bridges = translator.asked(config.live, tuple(source.rig.T_body_cams), maps)
         send_to = (*config.live.send_to, *(at for at, _ in bridges.values()))
         samples_in, samples_out = socket.socketpair()
         front_says, fast_hears_front = self._context.Pipe(duplex=False)[::-1]
@@ -146,9 +179,9 @@ class LiveRun:
         packets_out, packets = self._context.Pipe(duplex=False)[::-1]
         frames_out, frames = self._context.Pipe(duplex=False)[::-1]
         keyframes_out, keyframes = self._context.Pipe(duplex=False)[::-1]
-        self._ends = [
+        self._ends += [
             samples_in, samples_out, front_says, fast_hears_front, back_says, fast_hears_back, packets_out, packets,
-            frames_out, frames, keyframes_out, keyframes, *(() if web is None else (web.frames, web.map)),
+            frames_out, frames, keyframes_out, keyframes, *(() if web is None else (web.frames, web.map, web.back)),
         ]  # fmt: skip
         rig = source.rig
         fast = replace(config, live=replace(config.live, send_to=send_to))
@@ -165,12 +198,13 @@ class LiveRun:
             ),
             "back": partial(
                 back_process.run, config=config, rig=rig, noise=noise, keyframes=packets, to_fast=back_says,
-                to_map=keyframes_out, beginning=beginning, suite=suite,
+                to_map=keyframes_out, beginning=beginning, suite=suite, web=None if web is None else web.back,
+                guesses=self._guesses,
             ),
             "map": partial(
                 map_process.run, config=config, recording=source, out=out, source=asked, command=command,
                 frames=frames, keyframes=keyframes, beginning=beginning, base=base, suite=suite,
-                web=None if web is None else web.map,
+                web=None if web is None else web.map, drivers=self._drivers,
             ),
         }  # fmt: skip
         return {
@@ -178,6 +212,18 @@ class LiveRun:
             **{role: body for role, (_, body) in bridges.items()},
             **{role: partial(measured, body=body) for role, body in ours.items()},
         }
+
+    def add_driver(self, body: Callable[..., None]) -> None:
+        """Add a process that gets `MapCells` and sends guesses of `T_map_body` [4, 4]; before anything starts."""
+        maps, guesses = self._wire_of(self._drivers, 1), self._wire_of(self._guesses, 0)
+        self._roles["drive"] = partial(body, maps=maps, guesses=guesses)
+
+    def _wire_of(self, ours: list[Connection], end: int) -> Connection:
+        """Make a wire, of which one end (1: sends, 0: takes) is added to others of a child; return the other one."""
+        ends = self._context.Pipe(duplex=False)
+        ours.append(ends[end])
+        self._ends += ends
+        return ends[1 - end]
 
     @property
     def is_going(self) -> bool:

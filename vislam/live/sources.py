@@ -1,7 +1,5 @@
 """Which sensors a live run reads: the virtual cart, a recording in real time, or a cart's own."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket
@@ -18,17 +16,17 @@ from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
 from vislam.hw.library_cameras import WITH_IMU, frame_config, gives_frames, open_frame_camera, reads_own_imu
+from vislam.hw.port_readings import PortReadings
 from vislam.hw.reading_port import check_port
 from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
-from vislam.hw.source import InertialSource
+from vislam.hw.source import FrameSource, InertialSource, ReadingSource
 from vislam.imu import ImuNoise
 from vislam.live.device_owner import own_device
-from vislam.live.frames import FrameSource, NoCamera, OneCamera
+from vislam.live.frames import NoCamera, OneCamera
 from vislam.live.handed_frames import HandedFrames
 from vislam.live.handed_imu import HandedImu
-from vislam.live.port_readings import PortReadings
 from vislam.live.processes.child import Life
-from vislam.live.reading_source import ReadingSource, refuse_unread
+from vislam.live.reading_source import refuse_unread
 from vislam.live.replay import ReplaySource
 from vislam.live.run_live import LiveSource
 from vislam.live.virtual.cart import VirtualCart
@@ -41,7 +39,7 @@ from vislam.trajectory import Trajectory
 
 
 def _virtual_cart(rest: str, config: Config, _: SensorsConfig) -> tuple[LiveSource, Config]:
-    cart = VirtualCart(_place_options(rest), config.machine.gravity_m_s2)
+    cart = VirtualCart(place_options(rest), config.machine.gravity_m_s2)
     return cart, cart.settings(config)
 
 
@@ -95,7 +93,8 @@ def stored_sensors(out: Path) -> SensorsConfig:
     return validated(SensorsConfig, data, str(path))
 
 
-def _place_options(text: str) -> PlaceOptions:
+def place_options(text: str) -> PlaceOptions:
+    """Return what is asked of the virtual cart, as `option=value,...`; raises UsageError for what it does not know."""
     values: dict[str, object] = {}
     for part in filter(None, text.split(",")):
         name, equals, value = part.partition("=")

@@ -1,7 +1,5 @@
 """The state of a live run in one line."""
 
-from __future__ import annotations
-
 from vislam.hw.health import Health
 from vislam.live.run_live import LiveRun
 
@@ -9,8 +7,7 @@ from vislam.live.run_live import LiveRun
 def status_line(run: LiveRun) -> str:
     """Return where the cart is, how sure that is, what is wrong with the sensors, and how late poses are."""
     if not run.is_going:
-        waiting = ", ".join(run.waits_for) or "nothing"
-        return f"getting ready: waiting for {waiting}"
+        return f"getting ready: {_getting_ready(run)}"
     if run.is_brief:
         return "ending at once: the map's files and the report are left for later"
     if run.is_ending:
@@ -38,3 +35,13 @@ def status_line(run: LiveRun) -> str:
         f"{slow}x {x:7.2f} y {y:7.2f} z {z:5.2f} m +-{status['sigma_m']:.2f}  {status['speed_m_s']:.2f} m/s  "
         f"map {status['map_revision']}  sample to pose {late} (p50/p99)  {names}"
     )
+
+
+def _getting_ready(run: LiveRun) -> str:
+    """Return what is waited for, and how long that may take."""
+    waiting = ", ".join(run.waits_for) or "nothing"
+    compiled = sum(notes.get("compiled", 0) for notes in run.notes.values())
+    if not compiled:
+        return f"loading {waiting}: under a minute unless the machine is busy"
+    so_far = f"{compiled} functions so far, 5 minutes or so where none was compiled yet"
+    return f"compiling, once for this machine: {so_far}; waiting for {waiting}"

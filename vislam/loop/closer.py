@@ -1,7 +1,5 @@
 """LoopCloser: from a new keyframe to verified loop edges, with one recorded reason per candidate."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -22,7 +20,6 @@ from vislam.core.messages import (
     Submaps,
 )
 from vislam.loop.candidates import AppearanceCandidates, Candidate, odometry_candidates, proposer, view_bounds
-from vislam.loop.pose_table import PoseTable
 from vislam.loop.tags import TagBook, sight_tags
 from vislam.loop.verification import Likeness, Verification, Verifier, judge, tilt_error_rad
 from vislam.loop.view import View, make_view, make_views
@@ -34,6 +31,53 @@ _NOMINAL_DEPTH_M = 3.0  # of features without depth, to guess what two keyframes
 _MAX_TAGS = 2  # candidates per keyframe that saw the same tag
 _PROBES = 64  # points of the new keyframe that are projected into old ones; enough to rank overlaps
 _SHOWN_MATCHES = 40  # per candidate, for the picture that explains it
+
+
+class PoseTable:
+    """Keyframe ids, ascending, and their poses T_map_body; grows by doubling, follows graph updates."""
+
+    def __init__(self) -> None:
+        self._ids = np.empty(64, np.int64)
+        self._poses = np.empty((64, 4, 4))
+        self._slots: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def __getitem__(self, keyframe_id: int) -> Array:
+        """Return T_map_body [4, 4] of a keyframe."""
+        pose: Array = self._poses[self._slots[keyframe_id]]
+        return pose
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """The ids [N]."""
+        return self._ids[: len(self)]
+
+    @property
+    def poses(self) -> Array:
+        """The poses T_map_body [N, 4, 4]."""
+        return self._poses[: len(self)]
+
+    def add(self, keyframe_id: int, T_map_body: Array) -> None:
+        """Add a keyframe. Raises ValueError unless ids ascend and the pose is finite: the caller is at fault."""
+        count = len(self)
+        if count and keyframe_id <= self._ids[count - 1]:
+            raise ValueError(f"keyframe {keyframe_id} came after keyframe {self._ids[count - 1]}")
+        if T_map_body.shape != (4, 4) or not np.all(np.isfinite(T_map_body)):
+            raise ValueError(f"keyframe {keyframe_id} has no finite pose: {T_map_body.tolist()}")
+        if count == len(self._ids):
+            self._ids = np.resize(self._ids, 2 * count)
+            self._poses = np.resize(self._poses, (2 * count, 4, 4))
+        self._ids[count], self._poses[count] = keyframe_id, T_map_body
+        self._slots[keyframe_id] = count
+
+    def move(self, update: GraphUpdate) -> None:
+        """Take over the poses that moved; keyframes that are not known here are ignored."""
+        for keyframe_id, pose in zip(update.ids.tolist(), update.T_map_body, strict=True):
+            slot = self._slots.get(keyframe_id)
+            if slot is not None:
+                self._poses[slot] = pose
 
 
 class LoopCloser:
@@ -264,14 +308,12 @@ class LoopCloser:
             tilt_rad = tilt_error_rad(found.T_a_b, self._poses[candidate.id], self._poses[view.id])
         decision, reason = judge(found, tilt_rad)
         self.counters[decision.value] += 1
-        if decision is LoopDecision.ACCEPTED and found.T_a_b is not None and found.covariance is not None:
-            edges.append(
-                LoopEdge(
-                    self._next_edge_id, candidate.id, view.id, found.T_a_b, found.covariance, found.has_scale,
-                    found.inliers, candidate.score,
-                )
-            )  # fmt: skip
-            self._next_edge_id += 1
+        if decision is LoopDecision.ACCEPTED:
+            is_apart = not self._submaps.are_joined(candidate.id, view.id)
+            rivals = self._verifier.rivals(self._views[candidate.id], view, found) if is_apart else []
+            ends = candidate.id, view.id, candidate.score  # by which the last is known
+            edges += [one.edge(n, *ends) for n, one in enumerate((*rivals, found), self._next_edge_id)]
+            self._next_edge_id += 1 + len(rivals)
         return LoopCandidate(
             candidate.id, view.id, candidate.source, candidate.score, found.inliers, decision, reason, found.sigma_m,
             candidate.consistency, found.supporters, found.T_a_b, self._matches_px(candidate.id, view.id, found),

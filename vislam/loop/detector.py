@@ -1,7 +1,5 @@
 """`LoopDetector`: places seen before, by hand: images in, relative poses or the reason why there is none out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self

@@ -5,8 +5,6 @@ papers) is what can be asked of retrieval, which has no pose. Recall at full pre
 are part of every answer (`LoopTruthConfig`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

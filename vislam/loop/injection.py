@@ -1,7 +1,5 @@
 """False loops put among the true ones on purpose, to measure what keeps them out of the graph."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,18 +1,17 @@
 """loops.csv and retrieved.csv of a run: every loop candidate with its decision, and what the index had answered."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from io import StringIO, TextIOWrapper
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vislam.core.errors import DataError
+from vislam.core.files import csv_text
 from vislam.core.geometry import quaternion_xyzw_from_rotation, rotation_from_quaternion_xyzw
 from vislam.core.messages import Array, RetrievedKeyframe
 from vislam.core.reading import open_file
@@ -44,7 +43,7 @@ class LoopRow:
     consistency: float
     chi2: float  # at the graph's gate
     weight: float  # in the graph at the end; NaN: never offered to it
-    moved_rms_m: float  # shift of the map's keyframes by the update that took the edge in
+    moved_rms_m: float  # its share of the shift of the map's keyframes by the update that took it in
     moved_max_m: float
     T_from_to: Array | None  # [4, 4] that verification found; a unit direction without scale
     decision: str
@@ -150,12 +149,3 @@ def read_rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str,
 
 def _number(text: str) -> float:
     return float(text) if text else math.nan
-
-
-def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Return rows as CSV with a header."""
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue()

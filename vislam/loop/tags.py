@@ -5,8 +5,6 @@ where there is too little else to match. Pose by IPPE (Collins and Bartoli, IJCV
 plane: where both fit the corners, none is taken.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -8,7 +8,7 @@ from vislam.core.late import late
 
 if TYPE_CHECKING:
     from vislam.mapping.depth.localise import Guess
-    from vislam.mapping.drive.drive import Drive, DriveMap
+    from vislam.mapping.drive.drive_grid import Drive, DriveMap
     from vislam.mapping.mapper import Mapper
     from vislam.mapping.products import write_products
     from vislam.mapping.semantic.classes import LabelClasses
@@ -31,7 +31,7 @@ __all__ = [
 __getattr__ = late(
     __name__,
     {
-        "Drive DriveMap": "vislam.mapping.drive.drive",
+        "Drive DriveMap": "vislam.mapping.drive.drive_grid",
         "Guess": "vislam.mapping.depth.localise",
         "LabelClasses": "vislam.mapping.semantic.classes",
         "Mapper": "vislam.mapping.mapper",

@@ -1,7 +1,5 @@
 """Importing Open3D where the system has no libusb: the wheel libusb-package carries the library."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 from typing import Any

@@ -24,7 +24,7 @@ from vislam.mapping.dense.refine import refined_poses
 from vislam.mapping.depth.extract import ScanExtractor
 from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.depth.mono import LateDepth
-from vislam.mapping.drive.drive import DriveGrid, DriveMap
+from vislam.mapping.drive.drive_grid import DriveGrid, DriveMap
 from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
 from vislam.mapping.mesh.posed import PosedView, posed_views
 from vislam.mapping.mesh.volume import Volume

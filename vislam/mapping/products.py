@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
 
@@ -18,17 +18,18 @@ from vislam.core.kinds import Kinds, lacking
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh, poisson_mesh
 from vislam.mapping.cloud.surfels import Surfels
-from vislam.mapping.drive.drive import DriveGrid
-from vislam.mapping.drive.grid import Grid, write_grid
+from vislam.mapping.drive.grid import write_grid
 from vislam.mapping.formats.gaussians import write_gaussians
 from vislam.mapping.formats.mesh_files import write_glb, write_obj
 from vislam.mapping.formats.pcd import write_pcd
 from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mesh.atlas import textured
-from vislam.mapping.mesh.posed import PosedView
-from vislam.mapping.octree import Octree, OctreeLeaves, encode_bt, encode_ot
+from vislam.mapping.octree import encode_bt, encode_ot
 from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.layer_files import CLASSES_NAME, VOXELS_NAME, write_layer
+
+if TYPE_CHECKING:
+    from vislam.mapping.mapper import Mapper
 
 FILES = {
     "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",
@@ -59,47 +60,15 @@ class MapProduct(Protocol):
 
     FILE: str  # its name in the folder
 
-    def write(self, path: Path, source: MapSource) -> str | None:
+    def write(self, path: Path, source: Mapper) -> str | None:
         """Write it; return the reason where there is none."""
 
 
 PRODUCTS = Kinds[MapProduct]("vislam.map_products", {}, lacking("FILE", "write"))
 
 
-class MapSource(Protocol):
-    """What a map can be asked for."""
-
-    @property
-    def occupancy(self) -> Octree:
-        """The occupancy map."""
-
-    def coloured_octree(self) -> OctreeLeaves:
-        """Return the octree with colours."""
-
-    def cloud(self) -> Cloud:
-        """Return the cloud."""
-
-    def grid(self) -> Grid:
-        """Return the navigation grid."""
-
-    def drive(self) -> DriveGrid:
-        """Return the drive grid."""
-
-    def mesh(self) -> tuple[Mesh | None, str]:
-        """Return the mesh or why there is none."""
-
-    def posed_views(self) -> Iterable[PosedView]:
-        """Return what keyframes with dense depth saw, at their poses, one at a time."""
-
-    def surfels(self) -> Surfels:
-        """Return the surfels."""
-
-    def labels(self) -> LabelLayer | None:
-        """Return the labels, None where there are none."""
-
-
 def write_products(
-    source: MapSource, folder: Path, config: MapConfig, step: Callable[[str], None] | None = None,
+    source: Mapper, folder: Path, config: MapConfig, step: Callable[[str], None] | None = None,
     not_level: str | None = None,
 ) -> tuple[dict[str, Path], dict[str, str]]:  # fmt: skip
     """Write the configured products into a folder; return the files, and the reasons why some are missing.
@@ -228,7 +197,7 @@ def _write_mesh(path: Path, mesh: Mesh | None, reason: str) -> str | None:
     return None
 
 
-def _write_glb(path: Path, mesh: Mesh | None, reason: str, source: MapSource, atlas_px: int) -> str | None:
+def _write_glb(path: Path, mesh: Mesh | None, reason: str, source: Mapper, atlas_px: int) -> str | None:
     """Write a mesh as glTF, with pictures on it if they may take any pixels; return the reason if there is none."""
     if mesh is None:
         return reason

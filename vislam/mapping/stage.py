@@ -1,7 +1,5 @@
 """The map as a stage of the pipeline: keyframes and poses in, what has to be stored of them out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,8 +1,7 @@
 """The back half of the pipeline: what runs at the rate of keyframes, loop detector, graph and map."""
 
-from __future__ import annotations
-
 from collections import deque
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -105,6 +104,11 @@ class Back:
             self.graph.hold(memory.held)
         return update
 
+    def guess(self, T_map_body: Array) -> None:
+        """Take where the body is about now in the map of another run, [4, 4]: depth is asked whether that is so."""
+        if self._by_depth is not None:
+            self._by_depth.guess(T_map_body)
+
     def begin_recording(self, state: NavState | None, T_odom_body: Array) -> bool:
         """Prepare for the first keyframe of a new recording, whose axes are those of map until loops say otherwise.
 
@@ -117,8 +121,11 @@ class Back:
         return True
 
     @on_one_blas_thread
-    def add(self, odometry: OdometryKeyframe, seen: list[SeenFrame]) -> KeyframeStep:
-        """Take one keyframe and the frames before it in: find its loops, optimise, follow with the map."""
+    def add(self, odometry: OdometryKeyframe, seen: list[SeenFrame], undo: Sequence[int] = ()) -> KeyframeStep:
+        """Take one keyframe and the frames before it in: find its loops, optimise, follow with the map.
+
+        `undo` are ids of loops that a user takes out.
+        """
         keyframe = odometry.packet.keyframe
         edges: list[LoopEdge] = []
         candidates: list[LoopCandidate] = []
@@ -140,7 +147,7 @@ class Back:
             false = self._false.add(odometry.T_odom_body, edges)
             edges, candidates = edges + false, candidates + [as_candidate(edge) for edge in false]
         with self.clock.measure("graph"):
-            update = self.graph.add(odometry.packet, edges, odometry.T_odom_body)
+            update = self.graph.add(odometry.packet, edges, odometry.T_odom_body, undo)
         self._follow(update)
         scans = {} if self.map is None else self.map.add(odometry, self.T_map_odom @ odometry.T_odom_body, seen)
         retrieved, tags = ([], ()) if self.loops is None else (self.loops.retrieved, self.loops.tags(keyframe.id))
@@ -148,12 +155,12 @@ class Back:
         return KeyframeStep(odometry, update, edges, candidates, retrieved, record, scans, words, tags)
 
     @on_one_blas_thread
-    def finish(self) -> GraphUpdate:
-        """Optimise to convergence and bring the map to the final poses."""
+    def finish(self, undo: Sequence[int] = ()) -> GraphUpdate:
+        """Optimise to convergence and bring the map to the final poses; `undo` as for `add`."""
         if self.loops is not None:
             self.loops.close()
         with self.clock.measure("graph finish"):
-            update = self.graph.finish()
+            update = self.graph.finish(undo)
         self._follow(update)
         if self.map is not None:
             self.map.finish()

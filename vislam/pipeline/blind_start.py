@@ -4,8 +4,6 @@ Even motion is rest to an IMU. Where there are fixes, still samples are rest onl
 Fixes too rough to show one in seconds are not waited for.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

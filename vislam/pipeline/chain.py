@@ -1,7 +1,5 @@
 """The chain of keyframes: where visual odometry has the body on it, and the packet of each new keyframe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -197,9 +195,16 @@ def believed(track: TrackResult, chain: KeyframeChain, frontend: FrontEnd) -> Tr
     return TrackResult(vo, no_observations(), None, 0.0, "what was found looks like the keyframe, too far away")
 
 
-def torn(frame: Frame, chain: KeyframeChain, frontend: FrontEnd, imu: Inertial | None) -> bool:
-    """Tie nothing from a frame on to what was before, if the clock stepped there; return whether it did."""
+def torn(
+    frame: Frame, chain: KeyframeChain, frontend: FrontEnd, imu: Inertial | None, last_t_ns: int | None = None
+) -> bool:
+    """Tie nothing from a frame on to what was before, if the clock stepped there; return whether it did.
+
+    After a hole in camera and IMU since `last_t_ns` the filter alone begins again; None: other sensors go on in it.
+    """
     if not frame.follows_step:
+        if imu is not None and last_t_ns is not None:
+            imu.level_after_hole(last_t_ns, frame.t_ns, chain.id, chain.T_odom_body)
         return False
     seek_place(frontend, chain.id + 1)
     chain.tear()

@@ -5,8 +5,6 @@ spread that grows with the cube of time (Bar-Shalom et al., "Estimation with App
 2001, section 6.2.2). How strong that noise is shows each time how far a body was from where it would have coasted to.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 
 import numpy as np
@@ -20,9 +18,17 @@ _TWIST_S = 0.09  # over which a velocity is taken, at least: shorter, noise of p
 _RECENT_S = 3.0  # a motion that has become wilder is wilder now
 # density of acceleration that anything that carries a camera may begin with, rad^2/s^3 and m^2/s^3: after a second 28
 # degrees and 18 cm. A body that has only stood or gone straight has not shown how it turns
-_LEAST = np.array([0.7, 0.1])
+LEAST_DENSITY = np.array([0.7, 0.1])
 _MOST_M_S2 = 25.0  # that a carried camera has for a tenth of a second; impacts have more, for less
 _TAILS = 1.5  # times the sigma: motions change by fits and starts. Measured on nine of flights, hands and carts
+
+
+def jerked_m(dt_s: float) -> float:
+    """Return how far off where it coasts to a body may be jerked within a time.
+
+    Its velocity is that in the middle of `_TWIST_S`.
+    """
+    return 0.5 * _MOST_M_S2 * dt_s * (dt_s + _TWIST_S)
 
 
 class Coasting:
@@ -75,19 +81,15 @@ class Coasting:
             self._t_ns, self._poses, self._twists, self._t_twist_ns = [t_ns], [T_vo_body], twists, t_twist_ns
 
     def jerked_m(self, t_ns: int) -> float:
-        """Return how far off where it coasts to a body may be jerked while it is seen, since the last pose.
-
-        Its velocity is that in the middle of `_TWIST_S`.
-        """
-        dt_s = (t_ns - self._t_ns[-1]) / _NS
-        return 0.5 * _MOST_M_S2 * dt_s * (dt_s + _TWIST_S)
+        """Return how far off where it coasts to a body may be jerked while it is seen, since the last pose."""
+        return jerked_m((t_ns - self._t_ns[-1]) / _NS)
 
     def ahead(self, t_ns: int) -> tuple[Array, Array] | None:
         """Return the motion [4, 4] since the last pose and its covariance [6, 6]; None: there is no habit."""
         if self._t_twist_ns is None:
             return None
         dt_s, spread_s = (t_ns - self._t_ns[-1]) / _NS, (t_ns - self._t_twist_ns) / _NS
-        variance = np.maximum(self._density(spread_s), _LEAST) * (_TAILS**2 * spread_s**3 / 3.0)
+        variance = np.maximum(self._density(spread_s), LEAST_DENSITY) * (_TAILS**2 * spread_s**3 / 3.0)
         return se3_exp(self._twists[-1] * dt_s), np.diag(np.repeat(variance, 3))
 
     def _learn(self, t_ns: int, T_vo_body: Array) -> None:

@@ -1,7 +1,5 @@
 """A camera that sees nothing, or is silent: keyframes have to go on, for readings of further sensors hang on them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from enum import StrEnum
 
@@ -114,7 +112,7 @@ def dark(frame: Frame, t_ns: int) -> Frame:
     """Return a frame like another in which nothing is seen."""
     tracks = frame.tracks
     if tracks is not None:
-        tracks = chosen(tracks, np.zeros(len(tracks.track_ids), dtype=np.bool_))
+        tracks = replace(chosen(tracks, np.zeros(len(tracks.track_ids), dtype=np.bool_)), further=())
     return Frame(
         t_ns, frame.index, tuple(np.zeros_like(image) for image in frame.images),
         None if frame.color is None else np.zeros_like(frame.color),

@@ -5,8 +5,6 @@ graph tells, or one that somebody gave. What depth answers (`DepthLocaliser`) is
 several keyframes in a row agree through odometry; the graph tests it then as it tests all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -62,6 +60,10 @@ class DepthInMap:
         self._T_body_cam = rig.T_body_cams[0]
         self._last: _Last | None = None
         self.counters = {"asked": 0, "refused": 0, "alone": 0, "offered": 0}
+
+    def guess(self, T_map_body: Array) -> None:
+        """Take where the body is about now, [4, 4], at the next keyframe; it counts where the place is not known."""
+        self._told, self._way_m = T_map_body, 0.0
 
     def move(self, update: GraphUpdate) -> None:
         """Follow the keyframes that the graph moved, and the submaps that it joined."""

@@ -1,7 +1,5 @@
 """The front half of the pipeline: everything that runs at the rate of the sensors and gives the continuous pose."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -42,6 +40,7 @@ from vislam.pipeline.gravity import GravityWait, Phase, Start
 from vislam.pipeline.inertial_stages import Inertial, Since
 from vislam.pipeline.reading_intake import ReadingIntake
 from vislam.pipeline.settings import derived, refuse_without_scale
+from vislam.pipeline.smooth_motion import SmoothMotion
 from vislam.pipeline.steps import Estimate, FrontStep
 from vislam.sensors import Suite
 from vislam.trajectory.continuity import in_odom
@@ -97,6 +96,7 @@ class Front:
         if suite is not None and len(suite):
             self.readings = ReadingIntake.of_run(config, suite, noise, self.inertial)
         self._clock, self._waypoints, self._published = clock, Waypoints(), in_odom(config)
+        self._by_vision = SmoothMotion(config.graph, config.publish)
         self._last_frame_t_ns: int | None = None
 
     def resume(self, memory: FrontMemory) -> None:
@@ -157,7 +157,7 @@ class Front:
         """Track one frame, correct the filter with it, and hand over keyframes that are ready."""
         frame = self.camera_clock.in_imu_time(self.watch.see(frame))
         imu = self._imu
-        if torn(frame, self._chain, self.frontend, imu):
+        if torn(frame, self._chain, self.frontend, imu, self._last_frame_t_ns if self.readings is None else None):
             self._last_frame_t_ns = None
         since = Since() if imu is None else imu.since(self._last_frame_t_ns, frame.t_ns, self.camera_clock)
         with self._clock.measure("track"):
@@ -171,7 +171,7 @@ class Front:
             if self.gravity is not None:
                 ready = self.gravity.seek(since.span, track, still_image, at_rest, offset_sigma_s)
             estimate, state = self._estimate(track, since, at_rest)
-        T_odom_body = None if estimate is None else estimate.T_odom_body
+        T_odom_body = self._chain.T_vo_body.copy() if self._imu is None else estimate.T_odom_body if estimate else None
         if self.readings is not None:
             self.readings.see(frame.t_ns, T_odom_body)
         is_settled = self.begun.phase is Phase.SETTLED
@@ -251,8 +251,7 @@ class Front:
         """Return the pose in `odom` and the filter's state after this frame."""
         chain = self._chain
         if self._imu is None:
-            T_vo_body = chain.T_vo_body.copy()
-            return Estimate(T_vo_body, T_vo_body, np.inf), None
+            return self._by_vision.follow(track.vo, chain.T_vo_body.copy(), chain.is_torn), None
         shows_scale = self.watch.uniform.shows_scale
         estimate, state = self._imu.correct(track, at_rest, shows_scale, since.span, chain.by_vision(track.vo))
         chain.T_odom_body = None if estimate is None else estimate.T_odom_body

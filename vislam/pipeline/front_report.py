@@ -197,12 +197,7 @@ class RunWatch:
             front["frames_without_excitation"] = self.uniform.frames
         return {
             "front": front,
-            "camera feed": {
-                "frames": feed.frames,
-                "missing": feed.missing,
-                "repeated": feed.repeated,
-                "frozen": feed.frozen,
-            },
+            "camera feed": {name: getattr(feed, name) for name in ("frames", "missing", "repeated", "frozen")},
             **({"masks": dict(self._masks.problems)} if self._masks.problems else {}),
         }
 

@@ -1,7 +1,5 @@
 """The wait for gravity: the search for the first state, and the keyframes that wait for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
@@ -19,6 +17,7 @@ from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
 from vislam.frontend.result import identity_motion
 from vislam.frontend.start import Initialisation, Initialiser, level_at_once, moved_to
+from vislam.frontend.stillness import MIN_FRAMES
 from vislam.pipeline.blind_start import BlindStart, Said
 from vislam.pipeline.chain import KeyframeChain
 from vislam.pipeline.inertial_stages import Inertial
@@ -147,6 +146,7 @@ class GravityWait:
         self._noise = noise
         self._filtering, self._buffer = inertial.filtering, inertial.buffer
         self._refused: Initialisation | None = None  # the newest answer without a state
+        self._moved = 1 - MIN_FRAMES  # frames that were not still, beyond the first ones, of which that is not known
         self._waiting = WaitingKeyframes()
         self._early = None if knows_scale else EarlyFrames(config.ekf, rig, config.machine)
         gravity_m_s2 = config.machine.gravity_m_s2
@@ -182,6 +182,7 @@ class GravityWait:
         start = self._start
         if not start.holds_keyframes:
             return []
+        self._moved += not still_image
         if self._early is not None:
             self._early.see(track.vo.t_ns, track.observations, at_rest)
         self._initialiser.time_offset_sigma_s = time_offset_sigma_s
@@ -297,6 +298,8 @@ class GravityWait:
         states: dict[int, NavState] = {}
         if self._early is not None and found is not None and first is not None and found.T_odom_body is not None:
             states = self._early.states(first, self._waiting.t_ns, self._buffer.span, self._noise)
+            if found.status == "static" and self._moved <= 0:  # samples may begin after the camera
+                states = {t: replace(first, t_ns=t) for t in self._waiting.t_ns if t < first.t_ns} | states
             solved = self._waiting.provisional
             solved |= {t_ns: state.T_world_body for t_ns, state in states.items()}
             solved |= self._waiting.between(Trajectory(np.array(found.t_ns, dtype=np.int64), found.T_odom_body))

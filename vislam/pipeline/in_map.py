@@ -1,7 +1,5 @@
 """Where a run is in the map: its published pose there, and whether the place is known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.config import PublishConfig

@@ -1,17 +1,17 @@
 """What an IMU gives the front half: its samples, the filter that runs on them, and rest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vislam.config import Config
 from vislam.core.camera import Rig
+from vislam.core.geometry import level_rotation, so3_exp, transform
 from vislam.core.messages import AS_MODELLED, Array, GraphUpdate, ImuSpan, NavState, NoiseScale, Tracking
 from vislam.ekf.filtering import Filtering
 from vislam.frontend import TrackResult
 from vislam.frontend.camera_clock import CameraClock
+from vislam.frontend.result import lost_motion
 from vislam.frontend.stillness import Stillness
 from vislam.imu import (
     ConditionWatch,
@@ -94,8 +94,23 @@ class Inertial:
             return since
         biases = state.gyro_bias_rad_s, state.accel_bias_m_s2
         witness.see(track.vo, track.outliers, T_vo_body, self.buffer.as_felt, biases)
+        if track.vo.has_scale and (burst_ns := self.buffer.burst_ns(track.vo.t_ns)) is not None:
+            witness.doubt(burst_ns, track.vo.t_ns)  # stamps of arrival are no times of measurement
         self.buffer.believe(witness.until_ns, witness.since_ns)
         return since if witness.until_ns is None else Since(None, state)
+
+    def level_after_hole(self, last_t_ns: int, t_ns: int, keyframe_id: int, T_odom_body: Array | None) -> None:
+        """Begin the filter again, level by the newest samples, after a hole in which neither camera nor IMU measured.
+
+        A body has turned by an unknown angle meanwhile, and a linear filter comes back from half a radian at most.
+        `T_odom_body` [4, 4] is where it was at the last frame.
+        """
+        felt = self.buffer.after_hole(last_t_ns, t_ns)
+        if felt is None or T_odom_body is None or self.filtering.state is None:
+            return
+        yaw = float(np.arctan2(T_odom_body[1, 0], T_odom_body[0, 0]))
+        R = so3_exp(np.array([0.0, 0.0, yaw])) @ level_rotation(felt.accel_m_s2.mean(axis=0))
+        self.filtering.tear(lost_motion(t_ns, keyframe_id, True), transform(R, T_odom_body[:3, 3]))
 
     def between_keyframes(self, from_ns: int, to_ns: int) -> ImuSpan | None:
         """Return the samples between two keyframes, if what was seen between them does not contradict them."""

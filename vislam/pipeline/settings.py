@@ -1,7 +1,5 @@
 """The configuration that runs: what sensors and modes say of a setting is put into it once, before anything begins."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from vislam.config import Config, EkfConfig, GraphConfig
@@ -29,7 +27,7 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
         config = _without_camera(config, noise)
     readout_s = config.frontend.readout_s if config.window.readout_s is None else config.window.readout_s
     errors = common_errors(config.frontend, rig, noise)
-    by_imu = noise is not None and len(rig.cameras) == 1 and not rig.has_depth
+    by_imu = noise is not None and not rig.is_blind and not rig.is_stereo and not rig.has_depth
     scale_sigma = max(config.graph.scale_sigma, errors.scale_sigma)
     graph = replace(config.graph, scale_sigma=scale_sigma, edges_share_scale=by_imu)
     machine = config.machine
@@ -39,7 +37,7 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
         config,
         machine=machine,
         frontend=replace(config.frontend, mode=mode),
-        ekf=config.ekf if noise is None else _filter(config, mode, errors),
+        ekf=config.ekf if noise is None else _filter(config, mode, errors, bool(rig.further)),
         window=replace(config.window, readout_s=readout_s),
         graph=graph if noise is not None else without_gravity(graph, rig),
     )
@@ -89,10 +87,12 @@ def _without_camera(config: Config, noise: ImuNoise | None) -> Config:
     )  # fmt: skip
 
 
-def _filter(config: Config, mode: str, errors: CommonErrors) -> EkfConfig:
+def _filter(config: Config, mode: str, errors: CommonErrors, has_further: bool) -> EkfConfig:
     coupling = config.ekf.coupling
     if coupling == "auto":
-        coupling = "loose" if knows_scale(mode) else "tight"
+        # motions of the front end know nothing of what further cameras see
+        by_tracks = has_further and mode in ("stereo", "rgbd") and config.machine.slip_sigma_m_s is None
+        coupling = "tight" if by_tracks or not knows_scale(mode) else "loose"
     if config.machine.slip_sigma_m_s is not None and coupling == "tight":
         raise UsageError("--machine.slip-sigma-m-s needs --ekf.coupling loose, which has no use for tracks")
     readout_s = config.ekf.tight_readout_s

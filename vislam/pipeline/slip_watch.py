@@ -1,7 +1,5 @@
 """Whether the wheels of a sensor slip: its readings contradict what inertial data and vision say, again and again."""
 
-from __future__ import annotations
-
 from typing import Any
 
 # Chosen, not fitted to any drive: three good readings in a row that fail a gate of 0.999 come once in 10^9.

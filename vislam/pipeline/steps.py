@@ -1,7 +1,5 @@
 """What the halves of the pipeline answer: a step for every frame, one for every keyframe, and the end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from vislam.core.memory import GraphRecord, PackedScan, TagSighting, WordsMemory
@@ -25,9 +23,10 @@ from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 class Estimate:
     """Where odometry has the body at a frame."""
 
-    T_odom_before: Array  # [4, 4] by inertial data alone, from where it was at the last frame
+    T_odom_before: Array  # [4, 4] by inertial data or habit, from where it was at the last frame
     T_odom_body: Array  # [4, 4] with all that is known
     rate_sigma_rad_s: float  # of the gyroscope's bias; infinite without an IMU
+    moving: NavState | None = None  # without an IMU: pose and velocity with covariance; NaN for biases
 
     def shown(self, t_ns: int, published: Continuity) -> Array:
         """Return the pose in `odom` [4, 4] as it is published at a time: continuous where that is wanted."""
@@ -47,6 +46,11 @@ class FrontStep:
     T_keyframe_body: Array | None  # relative to it; None: only known by interpolation between keyframes
     keyframes: list[OdometryKeyframe]  # usually none or one; those that waited for gravity come together
     corrections: list[Correction]  # what the filter was told with it, usually one; none before it has a state
+
+    @property
+    def moving(self) -> NavState | None:
+        """Pose and velocity with covariance: by the filter, or by vision alone; None before initialisation."""
+        return self.state if self.state is not None or self.estimate is None else self.estimate.moving
 
 
 @dataclass(frozen=True, slots=True, eq=False)

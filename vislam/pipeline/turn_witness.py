@@ -1,7 +1,5 @@
 """Compares the turns of what drives with the gyroscope's, before any filter: swapped wheels, a wrong width, a delay."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections import deque
 from typing import Any

@@ -1,7 +1,5 @@
 """How a run begins: from nothing, in the map of another session, or where it was killed or interrupted."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """The rig of a camera that knows its own calibration: from a file that the user names, or else from the device."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from vislam.config import SensorsConfig

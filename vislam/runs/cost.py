@@ -1,7 +1,5 @@
 """What a run costs: CPU, memory, and the way to the first pose; compilation stands apart."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -19,7 +19,7 @@ from vislam.core import interrupts
 from vislam.core.errors import DataError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.memory import FrontMemory, GraphRecord, KeyframeEntry, SlamMemory
-from vislam.core.messages import Localisation, LoopDecision, Submaps, Tracking
+from vislam.core.messages import GraphUpdate, Localisation, LoopDecision, Submaps, Tracking
 from vislam.core.progress import Progress, silent
 from vislam.core.recording import Recording
 from vislam.frontend.masks import mask_warnings
@@ -31,7 +31,7 @@ from vislam.mapping.semantic.images import label_warnings
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.steps import KeyframeStep, Step
 from vislam.runs.cost import CostMeter
-from vislam.runs.evidence import KeyframeWitness, front_evidence, whole_evidence
+from vislam.runs.evidence import KeyframeWitness, front_evidence, judged, whole_evidence
 from vislam.runs.folder import RunLog
 from vislam.runs.further_sensors import further_readings
 from vislam.runs.geodetic_outputs import GeodeticOutputs, datums_of
@@ -43,7 +43,7 @@ from vislam.runs.run_input import RunInput
 from vislam.runs.session import Session, SessionWriter, recall
 from vislam.runs.show import show_map, show_paths, show_step
 from vislam.runs.sources import shaken, without_idle_cameras
-from vislam.runs.verdict import Evidence, judge
+from vislam.runs.verdict import Evidence
 from vislam.runs.viewer import NullViewer, open_viewer
 from vislam.slam import Slam
 from vislam.trajectory import Trajectory
@@ -207,7 +207,7 @@ class Run:
         self.cost.take(step)
         before = self.log.newest_tracking
         self.session.add_frame(self.log.add(step))
-        _log_changes(step, before)
+        _log_changes(step, before, self.log.zero_ns)
         for keyframe in step.keyframes:
             self._store(keyframe)
         with self.slam.clock.measure("view"):
@@ -239,8 +239,7 @@ class Run:
             self.log.add_keyframe(keyframe)
             self._store(keyframe)
         if finish.update is not None and finish.record is not None:
-            self.session.move(finish.update, finish.record)
-            self.viewer.move(finish.update)
+            self._settle(finish.update, finish.record)
         final, rows, loops = self._write_estimates()
         self._explain([] if is_brief else rows)
         truth = self._truth()
@@ -257,9 +256,8 @@ class Run:
             self.warnings += label_warnings(self.slam.back.counters.get("map", {}))
         self.warnings += mask_warnings(self.slam.front.report().counters.get("masks", {}))
         show_paths(self.viewer, final, truth, self.slam.front.report().alignment)
-        is_level = self.slam.front.start is not None
         if mapper is not None and len(self.log):
-            show_map(self.viewer, int(self.log.stamps_ns[-1]), mapper, is_level, is_last=True)
+            show_map(self.viewer, int(self.log.stamps_ns[-1]), mapper, self.slam.front.start is not None, is_last=True)
         self.warnings += filter(None, [self.viewer.close()])
         wall_s = time.perf_counter() - start  # everything but pictures and report
         if mapper is not None:
@@ -277,6 +275,11 @@ class Run:
             _LOG.warning("%s", warning)
         _LOG.info("%d frames, %d keyframes, %s", metrics["frames"], metrics["keyframes"], metrics["verdict"]["state"])
         return metrics
+
+    def _settle(self, update: GraphUpdate, record: GraphRecord) -> None:
+        """Bring everything to the final poses."""
+        self.session.move(update, record)
+        self.viewer.move(update)
 
     def _write_estimates(self) -> tuple[Trajectory, list[LoopRow], dict[str, int]]:
         """Write states and tables; return the final trajectory, the loop candidates and the counts of decisions."""
@@ -320,8 +323,7 @@ class Run:
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             counters |= back.counters
-        evidence = self._evidence(front, final)
-        verdict = judge(evidence, self.config.verdict)
+        evidence, verdict = judged(self._evidence(front, final), self.config.verdict, self.recording)
         self.warnings += front.noise_warnings
         found = self._found_in_map()
         by_truth, not_compared = accuracy(self.log, final, truth, front.alignment, self._input.problems)
@@ -388,9 +390,9 @@ class Run:
         return {**self.base, "found_t_s": (self.joined_t_ns - int(self.log.stamps_ns[0])) * 1e-9}
 
 
-def _log_changes(step: Step, before: Tracking | None) -> None:
+def _log_changes(step: Step, before: Tracking | None, zero_ns: int) -> None:
     """Log when vision is lost or found again, and when the place in the map is."""
-    track, t_s = step.front.track, step.front.frame.t_ns * 1e-9
+    track, t_s = step.front.track, (step.front.frame.t_ns - zero_ns) * 1e-9
     if track.vo.tracking is not before:
         _LOG.info("frame at %.3f s: tracking is %s; %s", t_s, track.vo.tracking, track.reason or "all is well")
     if step.localisation is Localisation.RELOCALISED:

@@ -1,7 +1,5 @@
 """Gathers the evidence of a run for its verdict: from the front half, live or not, and from the whole at the end."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -10,15 +8,29 @@ from typing import Any
 
 import numpy as np
 
-from vislam.config import Config, MachineConfig
+from vislam.config import Config, MachineConfig, VerdictConfig
 from vislam.core.errors import VislamError
 from vislam.core.memory import EdgeReport
 from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
+from vislam.core.recording import Recording
 from vislam.core.streams import Happening, StreamEvent
+from vislam.datasets.extrinsics import contradicted_extrinsics
 from vislam.imu import Preintegrated, preintegrate
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
-from vislam.runs.verdict import LOST_S, Apart, Driven, Evidence, Moved, TurnStep, force_agreement, turn_agreement
+from vislam.runs.verdict import (
+    LOST_S,
+    Apart,
+    Driven,
+    Evidence,
+    Moved,
+    Trust,
+    TurnStep,
+    Verdict,
+    force_agreement,
+    judge,
+    turn_agreement,
+)
 from vislam.trajectory import Trajectory, align, associate
 
 _MIN_COMPARED = 10  # poses
@@ -276,3 +288,15 @@ def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart
         if admitted:
             return Apart(rms_m, rms_m / max(float(np.sqrt(np.mean(admitted))), 1e-9), path_m)
     return None
+
+
+def judged(evidence: Evidence, config: VerdictConfig, recording: Recording) -> tuple[Evidence, Verdict]:
+    """Return evidence and verdict; of a run that is not trusted with what contradicts its extrinsics.
+
+    They are the usual cause of a run that fails from its first frame on.
+    """
+    verdict = judge(evidence, config)
+    if verdict.state is not Trust.TRUSTED:
+        evidence = replace(evidence, causes=contradicted_extrinsics(recording) + evidence.causes)
+        verdict = judge(evidence, config)
+    return evidence, verdict

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from vislam.config import Config, MachineConfig, dump, from_data, recorded
 from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import write_json, write_text
+from vislam.core.files import csv_text, write_json, write_text
 from vislam.core.log import FILE_NAME, is_written_to
 from vislam.core.memory import FrameEntry, SlamMemory
 from vislam.core.messages import (
     Array,
-    GraphUpdate,
     ImuSpan,
     LoopCandidate,
     LoopDecision,
@@ -34,11 +33,12 @@ from vislam.core.messages import (
 )
 from vislam.core.reading import read_json
 from vislam.core.revision import code_revision
-from vislam.loop import INJECTED, LoopRow, csv_text, is_injected, loops_text, retrieved_text
+from vislam.loop import INJECTED, LoopRow, is_injected, loops_text, retrieved_text
 from vislam.mapping.products import FILES as MAP_FILES
 from vislam.mapping.semantic.layer_files import CLASSES_NAME as LABEL_CLASSES
 from vislam.pipeline.steps import KeyframeStep, Step
 from vislam.runs.geodetic_outputs import LINES, TABLES
+from vislam.runs.loop_shifts import LoopShifts
 from vislam.runs.session import Session, has_frames
 from vislam.runs.sources import recorded_path
 from vislam.trajectory import Alignment, Trajectory, write_states_csv, write_tum
@@ -70,11 +70,10 @@ def prepare(out: Path, overwrite: bool, base: MapChoice | None = None) -> None:
     """
     if base is not None and base.session.resolve().parent == out.resolve():
         raise UsageError(f"--map {base.path} is in --out {out}, where it would be replaced; choose a new folder")
-    if out.exists() and (not out.is_dir() or any(path.name != _CALIBRATIONS for path in out.iterdir())):
+    if _is_taken(out):
         files = _files_of_run(out)
-        is_run = (out / "manifest.json").is_file()
         is_empty = _holds_nothing(out, files)
-        if not (is_run or is_empty):
+        if not ((out / "manifest.json").is_file() or is_empty):
             raise UsageError(f"--out {out} exists and is not a run; choose a new folder")
         if not (overwrite or is_empty):
             raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
@@ -85,6 +84,20 @@ def prepare(out: Path, overwrite: bool, base: MapChoice | None = None) -> None:
                 path.unlink(missing_ok=True)
     with storage(out):
         out.mkdir(parents=True, exist_ok=True)
+
+
+def _is_taken(out: Path) -> bool:
+    """Return whether something stands where a run is to be made."""
+    return out.exists() and (not out.is_dir() or any(path.name != _CALIBRATIONS for path in out.iterdir()))
+
+
+def _new_run(out: Path) -> str:
+    """Return how to get a run where there is none, as `prepare` allows it."""
+    if not _is_taken(out) or _holds_nothing(out, _files_of_run(out)):
+        return f"start one with --out {out}"
+    if (out / "manifest.json").is_file():
+        return f"start one with --out {out} --overwrite"
+    return "name the folder of a run, or start one with --out and a new folder"
 
 
 def _files_of_run(out: Path) -> list[Path]:
@@ -138,11 +151,9 @@ def _read_json(path: Path) -> dict[str, Any]:
     """Return an object of a run folder."""
     try:
         data = read_json(path)
-    except FileNotFoundError as error:
-        raise UsageError(
-            f"{path.parent} holds no run to resume ({path.name} is missing); start one with --out {path.parent}, and "
-            "with --overwrite if the folder exists"
-        ) from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        out = path.parent
+        raise UsageError(f"{out} holds no run to resume ({path.name} is missing); {_new_run(out)}") from error
     except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be read: {error}; start the run again with --overwrite") from error
     if not isinstance(data, dict):
@@ -258,8 +269,7 @@ class RunLog:
         self._candidates: list[LoopCandidate] = []
         self._edge_ids: dict[tuple[int, int, bool], int] = {}  # by ends, and whether it was made up on purpose
         self._retrieved: list[RetrievedKeyframe] = []
-        self._positions: dict[int, Array] = {}  # of the keyframes in the map, in order of their ids
-        self._shifts: dict[int, tuple[float, float]] = {}  # edge: rms and largest shift of the update that took it in
+        self._shifts = LoopShifts()
         self.revisions = 0
         self._first_id = 0  # of the keyframes of this recording; those before are a map's
 
@@ -274,6 +284,11 @@ class RunLog:
     def stamps_ns(self) -> NDArray[np.int64]:
         """Times [N] of the frames so far."""
         return np.array([frame.t_ns for frame in self._frames], dtype=np.int64)
+
+    @property
+    def zero_ns(self) -> int:
+        """Time of the first frame, from which seconds count; there has to be one."""
+        return self._frames[0].t_ns
 
     @property
     def newest_tracking(self) -> Tracking | None:
@@ -296,8 +311,8 @@ class RunLog:
         return len(self._candidates)
 
     def shifts(self, edge_ids: Iterable[int]) -> dict[int, tuple[float, float]]:
-        """Return the rms and largest shift in metres of the update that took in each of these loop edges."""
-        return {i: self._shifts[i] for i in edge_ids if i in self._shifts}
+        """Return the rms and largest shift in metres that is each loop edge's own, of those that were taken in."""
+        return self._shifts.of(edge_ids)
 
     @property
     def keyframes(self) -> int:
@@ -314,8 +329,8 @@ class RunLog:
             self._keyframe_t_ns[packet.keyframe.id] = packet.keyframe.t_ns
             if packet.imu is not None:
                 self._spans[packet.keyframe.id] = packet.imu
-        self._candidates, self._retrieved, self._shifts = session.candidates(), session.retrieved(), session.shifts()
-        self._place(memory)
+        self._candidates, self._retrieved = session.candidates(), session.retrieved()
+        self._shifts.restore(memory, session.shifts())
         for loop in memory.graph.loops:
             self._name(loop.edge)
         self.revisions = memory.graph.revision
@@ -324,14 +339,11 @@ class RunLog:
         """Number keyframes on from those of a map."""
         self._first_id = len(memory.graph.packets)
         self._take_map(memory)
-        self._place(memory)
+        self._shifts.place(memory)
 
     def _take_map(self, memory: SlamMemory) -> None:
         stamps = (packet.keyframe for packet in memory.graph.packets[: self._first_id])
         self._map_t_ns = {keyframe.id: keyframe.t_ns for keyframe in stamps}
-
-    def _place(self, memory: SlamMemory) -> None:
-        self._positions = {k: T[:3, 3] for k, T in enumerate(memory.graph.T_map_body)}
 
     def add(self, step: Step) -> FrameEntry:
         """Remember one step; return what is remembered of its frame."""
@@ -339,7 +351,7 @@ class RunLog:
         entry = FrameEntry(
             front.frame.t_ns, front.keyframe_id, front.T_keyframe_body, front.T_odom_body, step.T_map_body,
             vo.tracking, vo.inliers, vo.keyframe_id, front.track.reason, step.localisation, step.submap,
-            None if front.state is None else motion_of(front.state),
+            None if front.moving is None else motion_of(front.moving),
         )  # fmt: skip
         self._frames.append(entry)
         if front.state is not None and front.track.keyframe is not None:
@@ -358,24 +370,11 @@ class RunLog:
         self._retrieved += step.retrieved
         for edge in step.edges:
             self._name(edge)
-        self._follow(step.update)
-        self._positions.setdefault(keyframe.id, (step.update.T_map_odom @ step.odometry.T_odom_body)[:3, 3])
+        self._shifts.follow(step)
         self.revisions = step.update.revision
 
     def _name(self, edge: LoopEdge) -> None:
         self._edge_ids[edge.from_id, edge.to_id, is_injected(edge.id)] = edge.id
-
-    def _follow(self, update: GraphUpdate) -> None:
-        """Take over what an update moved, and note by how much for the loops that it took in."""
-        square, largest, known = 0.0, 0.0, len(self._positions)
-        for keyframe_id, T in zip(update.ids.tolist(), update.T_map_body, strict=True):
-            old = self._positions.get(keyframe_id)
-            if old is not None:
-                shift = float(np.linalg.norm(T[:3, 3] - old))
-                square, largest = square + shift**2, max(largest, shift)
-            self._positions[keyframe_id] = T[:3, 3]
-        rms = float(np.sqrt(square / max(known, 1)))
-        self._shifts |= dict.fromkeys(update.accepted_loop_ids, (rms, largest))
 
     def final_trajectory(
         self, ids: list[int], T_map_body: Array, states: list[NavState], machine: MachineConfig
@@ -439,7 +438,7 @@ class RunLog:
             report = loop_reports.get(edge_id)
         if report is not None:
             decision, reason = report.decision, f"{candidate.reason}; {report.reason}"
-        rms_m, max_m = self._shifts.get(edge_id, (math.nan, math.nan))
+        rms_m, max_m = self._shifts[edge_id]
         return LoopRow(
             from_id=candidate.from_id,
             to_id=candidate.to_id,

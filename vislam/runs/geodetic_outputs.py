@@ -1,7 +1,5 @@
 """Trajectories as latitude, longitude and height where a further sensor has a datum: tables, and lines on a map."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -13,10 +11,9 @@ from numpy.typing import NDArray
 
 from vislam.config import FurtherSensorsConfig
 from vislam.core.errors import DataError
-from vislam.core.files import write_text
+from vislam.core.files import csv_text, write_text
 from vislam.core.messages import Array, NavState
 from vislam.datasets.sensor_files import local_frame
-from vislam.loop import csv_text
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.measuring_frame import UP, frame_pose, frame_variables
 from vislam.sensors.toml import load_sensor_setup

@@ -1,7 +1,5 @@
 """A finished run as plain values, for scripts and notebooks: `load_run("runs/desk")`."""
 
-from __future__ import annotations
-
 import base64
 from dataclasses import dataclass
 from html import escape

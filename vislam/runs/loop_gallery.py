@@ -1,7 +1,5 @@
 """Pictures that explain loop decisions: both images of a candidate side by side, with the matches between them."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter, deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What the numbers of a run say: its accuracy, what makes it doubtful, and whether it is a result at all."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -161,6 +159,5 @@ def refuse(metrics: dict[str, Any], out: Path) -> None:
     if metrics["frames"] == 0:
         raise DataError(f"{metrics['name']}: not one usable frame; run `vislam doctor` on it")
     if metrics["verdict"]["state"] == Trust.LOST:
-        raise TrackingLostError(
-            f"{metrics['name']}: {metrics['verdict']['reasons'][0]}; see tracking.csv and report.html in {out}"
-        )
+        why = "; ".join(metrics["verdict"]["reasons"][:3])  # a cause comes before what it leads to
+        raise TrackingLostError(f"{metrics['name']}: {why}; see tracking.csv and report.html in {out}")

@@ -4,8 +4,6 @@ Samples are written raw, with their calibration beside them, which readers apply
 dropped and counted; no sensor ever waits for the disk.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading
@@ -34,7 +32,6 @@ from vislam.datasets.recorder import Recorder
 from vislam.datasets.tables import read_frame_stamps
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.video import VideoCamera
-from vislam.hw.cameras.webcam import Webcam
 from vislam.hw.health import Health
 from vislam.hw.library_cameras import gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
@@ -49,9 +46,10 @@ _READ_S = 0.2  # a reading thread looks so often whether to stop
 _WRITE_S = 0.05  # inertial samples wait at most so long for an image that does not come
 _TOLD_S = 1.0  # between looks at the free space, and lines of progress
 _JOIN_S = 2.0
+_SAMPLES = 8000  # that may wait for the disk: 18 s at 450 Hz
 _FIRST_IMAGE_S = 5.0
 _NAMED_EVENTS = 10  # one by one, to a person
-Images = Webcam | VideoCamera | LibraryCamera[CapturedImage] | LibraryCamera[Frame]
+Images = VideoCamera | LibraryCamera[CapturedImage] | LibraryCamera[Frame]
 Shot = CapturedImage | Frame
 # x forward, y left, z up of the body, for a camera that looks ahead: x right, y down, z forward
 _T_BODY_CAM = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -180,7 +178,7 @@ class _Recording:
         self._inertial = inertial
         self._images = images
         self._readings = readings
-        self._samples: Queue[ImuSample | MagSample] = Queue(config.imu_queue)
+        self._samples: Queue[ImuSample | MagSample] = Queue(_SAMPLES)
         self._frames: Queue[Shot] = Queue(config.image_queue)
         self._is_over = is_over
         self._drops_images = drops_images  # when the queue is full, as with a camera; else a video waits
@@ -348,7 +346,7 @@ class _Recording:
         }
         if self._images is not None:
             data["stamped_by"] = self._images.stamped_by
-        if isinstance(self._images, Webcam | LibraryCamera):
+        if isinstance(self._images, LibraryCamera):
             data["camera_settings"] = [asdict(setting) for setting in self._images.settings]
         write_text(recorded.folder / "recording.json", json.dumps(data, indent=1) + "\n")
 

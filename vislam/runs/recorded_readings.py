@@ -3,26 +3,24 @@
 `vislam run FOLDER --sensors.file FOLDER/sensors.toml` reads them again.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from vislam.core.errors import UsageError
 from vislam.core.files import write_text
 from vislam.core.reading import read_toml
-from vislam.core.readings import Reading
 from vislam.datasets.recorder import Recorder
+from vislam.hw.port_readings import PortReadings
 from vislam.hw.reading_port import check_port
 from vislam.sensors.geodetic import Geodetic
-from vislam.sensors.toml import SensorPort, SensorSetup, load_sensor_setup
+from vislam.sensors.toml import SensorSetup, load_sensor_setup
 
 FILE_NAME = "sensors.toml"
 # keys of how a device is read; a table of readings is read otherwise
@@ -32,43 +30,15 @@ _OF_PORTS = (
 )  # fmt: skip
 
 
-class PortReader(Protocol):
-    """What reads devices at ports; `vislam.live.port_readings.PortReadings` does."""
-
-    def read(self) -> list[Reading]:
-        """Return the readings that came since the last call, at once, stamped by CLOCK_MONOTONIC."""
-        ...
-
-    def status(self) -> dict[str, str]:
-        """Return by sensor "well", or its problem."""
-        ...
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """Return by sensor how many readings came, and how often each fault occurred."""
-        ...
-
-    def datums(self) -> dict[str, Geodetic]:
-        """Return by receiver where its frame begins, as far as it has reported."""
-        ...
-
-    def close(self) -> None:
-        """Give all devices back; may be called twice."""
-        ...
-
-
-OpenPorts = Callable[[Mapping[str, SensorPort], "socket.socket | None"], PortReader]
-
-
 @dataclass(frozen=True, slots=True)
 class FurtherPorts:
-    """Sensors that are to be recorded, and what reads them."""
+    """Sensors that are to be recorded."""
 
     setup: SensorSetup
     tables: Mapping[str, Mapping[str, Any]]  # of each sensor, as the file has them
-    open: OpenPorts
 
 
-def further_ports(path: Path, open_ports: OpenPorts) -> FurtherPorts:
+def further_ports(path: Path) -> FurtherPorts:
     """Return the sensors `[sensors.NAME]` of a cart's file.
 
     Raises UsageError for a file that cannot be used, and for a sensor that has nothing to be recorded from.
@@ -80,7 +50,7 @@ def further_ports(path: Path, open_ports: OpenPorts) -> FurtherPorts:
             f"{path}: [sensors.{missing[0]}]: it needs a port to be recorded from; docs/more-sensors.md, Live"
         )
     tables = read_toml(path)["sensors"]
-    return FurtherPorts(setup, tables, open_ports)
+    return FurtherPorts(setup, tables)
 
 
 class ReadingRecorder:
@@ -104,7 +74,7 @@ class ReadingRecorder:
                 check_port(port)
         self._asked = asked
         self._wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) if at_bridge else None
-        self._reader: PortReader | None = None
+        self._reader: PortReadings | None = None
         self._recorder: Recorder | None = None
         self._folder = Path()
         self._datums: dict[str, Geodetic] = {}
@@ -118,7 +88,7 @@ class ReadingRecorder:
     def begin(self, recorder: Recorder, folder: Path) -> None:
         """Open the ports, and write what the sensors are; raises StorageError."""
         self._recorder, self._folder = recorder, folder
-        self._reader = self._asked.open(self._asked.setup.ports, None if self._wire is None else self._wire[1])
+        self._reader = PortReadings(self._asked.setup.ports, None if self._wire is None else self._wire[1])
         for name in self._asked.setup.ports:
             recorder.begin_readings(name, self._header(name))
         self._describe()

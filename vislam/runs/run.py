@@ -1,7 +1,5 @@
 """A source run into a folder from its opening to the report: what `vislam.run` and `vislam run` do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path

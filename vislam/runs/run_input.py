@@ -1,7 +1,5 @@
 """What a run is fed with: a recording with the readings of further sensors, or what of it is left to process."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The heading and place of a measuring frame from points that are known in it and in the world."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

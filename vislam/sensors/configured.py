@@ -1,7 +1,5 @@
 """Sensors that a configuration file can name: made from settings, and able to draw readings of themselves."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np

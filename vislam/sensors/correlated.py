@@ -1,7 +1,5 @@
 """An error that neighbouring readings share: any sensor, with a state for it (Gauss-Markov, one for each source)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

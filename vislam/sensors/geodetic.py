@@ -1,7 +1,5 @@
 """Latitude, longitude and height as east, north, up in a local frame, and back: WGS84, closed form."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A reading as a linear system at an estimate; errors of a sensor's own code are reported by its name here."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

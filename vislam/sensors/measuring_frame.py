@@ -4,8 +4,6 @@
 lie in the sensor's frame. The estimate starts at the world's origin, so heading and place hang little on one another.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, TypeVar

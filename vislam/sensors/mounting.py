@@ -1,7 +1,5 @@
 """How a vehicle's base sits in the body: its axle, and which way it drives."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

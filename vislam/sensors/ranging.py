@@ -1,7 +1,5 @@
 """The heading and place of a frame of anchors from ranges to them, found without any guess."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

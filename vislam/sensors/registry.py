@@ -1,7 +1,5 @@
 """Kinds of sensors by name: built in, registered by a program, or brought by a package that is installed."""
 
-from __future__ import annotations
-
 import re
 
 from vislam.core.errors import UsageError

@@ -1,7 +1,5 @@
 """What a sensor has to say of itself: the one definition that every estimator uses."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Readings drawn from a known path with a sensor's own noise, and what goes wrong with real ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The sensors of one machine, and where their own variables stand in the state of an estimator."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

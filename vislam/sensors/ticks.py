@@ -1,7 +1,5 @@
 """Counts of wheel encoders as speeds."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

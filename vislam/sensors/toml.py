@@ -1,7 +1,5 @@
 """The sensors of one machine from a TOML file: `[sensors.NAME]` with kind, file and settings."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The body on a true path, for sensors that are drawn on it: a world's, or that of a recording with truth."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline

@@ -6,7 +6,7 @@ systems) and Bar-Shalom et al. 2001 (NEES); with equal association the numbers a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -23,6 +23,7 @@ Alignment = Literal["se3", "sim3", "yaw", "first", "none"]
 
 _SEGMENTS_M = (1.0, 5.0, 10.0)
 _SEGMENT_TOLERANCE = 0.1  # of the length, as evo
+_MISORDERED_DEG, _MISORDERED_SHARE = 2.0, 0.3  # of relative rotations over 1 s, and what another order leaves of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +177,25 @@ def evaluate(
         "rpe_segments": {f"{length:g}": _relative(aligned, length_m=length) for length in _SEGMENTS_M},
         "path_m": float(np.linalg.norm(np.diff(pairs.reference[:, :3, 3], axis=0), axis=1).sum()),
     }
+
+
+def are_misordered(
+    estimate: Trajectory, truth: Trajectory, association: Association = "interpolate", max_gap_s: float | None = None
+) -> bool:
+    """Return whether rotations fit each other only with one quaternion's w at the other end; which one cannot be seen.
+
+    In the wrong order a motion turns the inverse way, whatever the frames are.
+    """
+    pairs = associate(estimate, truth, association, max_gap_s)
+    usual_deg = _relative(pairs, duration_s=1.0)["deg"]
+    if usual_deg is None or usual_deg < _MISORDERED_DEG:
+        return False
+    q_xyzw = Rotation.from_matrix(pairs.estimate[:, :3, :3]).as_quat()
+    others = [pairs.estimate.copy(), pairs.estimate.copy()]
+    for other, shift in zip(others, (-1, 1), strict=True):
+        other[:, :3, :3] = Rotation.from_quat(np.roll(q_xyzw, shift, axis=1)).as_matrix()
+    found = [_relative(replace(pairs, estimate=other), duration_s=1.0)["deg"] or 0.0 for other in others]
+    return min(found) < _MISORDERED_SHARE * usual_deg
 
 
 def _relative(pairs: Pairs, duration_s: float | None = None, length_m: float | None = None) -> dict[str, float | None]:

@@ -1,4 +1,4 @@
-"""Trajectory files: TUM, KITTI and EuRoC, read strictly and written atomically.
+"""Trajectory files: TUM and KITTI, read strictly and written atomically.
 
 A damaged line is an error with its file and line, never a pose that is quietly wrong.
 """
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from vislam.core.collector import paused
 from vislam.core.errors import DataError
-from vislam.core.files import write_text
+from vislam.core.files import write_lines
 from vislam.core.geometry import quaternion_xyzw_from_rotation
 from vislam.core.messages import Array
 from vislam.core.reading import open_file
@@ -47,23 +47,22 @@ def read_tum(path: Path) -> Trajectory:
 @paused()
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write a TUM file with exact nanoseconds; the file appears whole or not at all. Raises StorageError."""
-    q, row = _quaternions_xyzw(trajectory), "%s%d.%09d" + " %.9f" * 7 + "\n"
-    rows = ["# t_s tx ty tz qx qy qz qw\n"]
+    write_lines(path, _tum_lines(trajectory))
+
+
+def _tum_lines(trajectory: Trajectory) -> Iterator[str]:
+    q, row = _quaternions_xyzw(trajectory), "%s%d.%09d" + " %.9f" * 7
+    yield "# t_s tx ty tz qx qy qz qw"
     for t_ns, p, o in zip(trajectory.t_ns.tolist(), trajectory.positions_m.tolist(), q.tolist(), strict=True):
         sign, (seconds, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
-        rows.append(row % (sign, seconds, fraction, *p, *o))
-    write_text(path, "".join(rows))
+        yield row % (sign, seconds, fraction, *p, *o)
 
 
-def read_kitti(path: Path, times: Path | NDArray[np.int64]) -> Trajectory:
-    """Read a KITTI pose file (12 numbers of a row-major 3x4 matrix per line) with its times file or times in ns [N]."""
+def read_kitti(path: Path, t_ns: NDArray[np.int64]) -> Trajectory:
+    """Read a KITTI pose file (12 numbers of a row-major 3x4 matrix per line) whose poses have times in ns [N]."""
     _, numbers, lines = read_table(path, separator=None, columns=(12,), with_stamp=False)
-    if isinstance(times, Path):
-        t_ns = read_kitti_times(times, len(numbers), path)
-    else:
-        t_ns = np.asarray(times, dtype=np.int64)
-        _check_count(len(t_ns), len(numbers), path)
-        _check_increasing(t_ns, path, lines)
+    _check_count(len(t_ns), len(numbers), path)
+    _check_increasing(t_ns, path, lines)
     return Trajectory(t_ns, kitti_poses(numbers, path, lines))
 
 
@@ -85,18 +84,8 @@ def kitti_poses(numbers: Array, path: Path, lines: list[int]) -> Array:
 def write_kitti(trajectory: Trajectory, path: Path) -> None:
     """Write a KITTI pose file; the format holds no times. Raises StorageError."""
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12).tolist()
-    row = " ".join(["%.12g"] * 12) + "\n"
-    write_text(path, "".join(row % tuple(numbers) for numbers in rows))
-
-
-def read_euroc(path: Path) -> Trajectory:
-    """Read EuRoC truth: 17 columns (state_groundtruth_estimate0) or 8 (mocap0): ns, position, quaternion w first.
-
-    Velocity and biases of the long layout are not part of a trajectory and are ignored once they are valid numbers.
-    """
-    stamps, numbers, lines = read_table(path, separator=",", columns=(8, 17))
-    t_ns = np.array([stamp_ns(text, 1, path, n) for text, n in zip(stamps, lines, strict=True)], dtype=np.int64)
-    return trajectory_of_rows(t_ns, (numbers[:, 0:3], numbers[:, [4, 5, 6, 3]]), path, lines)
+    row = " ".join(["%.12g"] * 12)
+    write_lines(path, (row % tuple(numbers) for numbers in rows))
 
 
 def data_lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[int, str]]:

@@ -41,10 +41,11 @@ _OTHERS = {
 _SAMPLE = 100  # rows by which a file is recognised
 _UNITS = {1.0: "nanoseconds", 1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
 _EPOCH = ((1e17, 1.0), (1e14, 1e3), (1e11, 1e6))  # stamps since 1970 from 1973 to 5138 show their unit
+_SINCE_1970_S = 1e8  # of a stamp, and more in smaller units
 _NS_STEP = 1e4  # poses are neither three hours apart nor 10 us
 _UNIT_NAMES = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6}
 _UNIT_NAMES |= {"s": 1e9, "sec": 1e9, "secs": 1e9, "seconds": 1e9}
-_TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp"}
+_TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp", "sec", "secs", "seconds", "utime"}
 _TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot", "ori", "o"}
 _PLACES = {"p", "pos", "position", "t", "translation", "trans", "location"}
 _RATES = {"v", "vel", "velocity", "twist", "linear", "angular", "b", "bias", "cov", "covariance", "sigma", "std", "acc"}
@@ -74,6 +75,7 @@ class _Layout:
     matrix: int | None = None  # first of 12 columns
     unit_ns: float = 1e9
     header: bool = False  # whether the first line is names
+    nanos: int | None = None  # column of the nanoseconds behind whole seconds
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -84,10 +86,10 @@ def read_trajectory(path: Path) -> Trajectory:
     return found.trajectory
 
 
-def recognise(path: Path, times: Path | None = None) -> Recognised:
+def recognise(path: Path, times: Path | None = None, or_times: Path | None = None) -> Recognised:
     """Read a trajectory file by what it holds.
 
-    A file without times (KITTI) takes those of `times`, of times.txt beside it, or where KITTI keeps it.
+    A file without times (KITTI) takes `times`, times.txt beside it or where KITTI keeps it, else `or_times`.
 
     Raises:
         DataError: with file and line, for what is no trajectory, is damaged, or is another kind of file.
@@ -100,7 +102,7 @@ def recognise(path: Path, times: Path | None = None) -> Recognised:
     left_out = f"; {lost} rows of NaN left out" if lost else ""
     left_out += "; last line cut short, left out" if is_cut else ""
     if layout.stamp is None:
-        return _without_stamps(path, times, layout, numbers, lines)
+        return _without_stamps(path, times or _times_of(path) or or_times, layout, numbers, lines)
     if times is not None:
         raise DataError(f"{path} has times of its own ({layout.name}); leave out the option for {times}")
     t_ns = np.array([stamp_ns(s, layout.unit_ns, path, n) for s, n in zip(stamps, lines, strict=True)], dtype=np.int64)
@@ -118,20 +120,22 @@ def recognise(path: Path, times: Path | None = None) -> Recognised:
     return Recognised(found, f"{kind}; {len(found)} poses over {found.duration_s:.1f} s{left_out}")
 
 
-def _without_stamps(path: Path, times: Path | None, layout: _Layout, numbers: Array, lines: list[int]) -> Recognised:
+def _times_of(path: Path) -> Path | None:
     sequence = path.parent.parent / "sequences" / path.stem / "times.txt"  # as KITTI's own poses/00.txt
-    beside = next((file for file in (path.with_name("times.txt"), sequence) if file.is_file()), None)
-    poses, chosen = kitti_poses(numbers, path, lines), times or beside
-    if chosen is None:
+    return next((file for file in (path.with_name("times.txt"), sequence) if file.is_file()), None)
+
+
+def _without_stamps(path: Path, times: Path | None, layout: _Layout, numbers: Array, lines: list[int]) -> Recognised:
+    poses = kitti_poses(numbers, path, lines)
+    if times is None:
         t_ns = np.arange(len(poses)) * (10**9 // _KITTI_HZ)
         return Recognised(
             Trajectory(t_ns, poses),
             f"{layout.name} without times, {len(poses)} poses, taken for 10 a second",
             timed=False,
         )
-    t_ns = read_kitti_times(chosen, len(poses), path)
-    given = "given" if times else "found"
-    return Recognised(Trajectory(t_ns, poses), f"{layout.name}, times {given} in {chosen}; {len(poses)} poses")
+    t_ns = read_kitti_times(times, len(poses), path)
+    return Recognised(Trajectory(t_ns, poses), f"{layout.name}, times in {times}; {len(poses)} poses")
 
 
 def _refuse_others(path: Path) -> None:
@@ -164,7 +168,9 @@ def _layout(path: Path) -> _Layout:
     width = len(names if has_header else rows[0])
     if (named := _by_names(names, separator, width, rows)) is not None:
         stated, stamp, position, quaternion, unit_ns = named
-        return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header)
+        nanos = _nanos_of(names, stamp)
+        unit_ns = unit_ns if nanos is None else 1e9
+        return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header, nanos)
     return _by_numbers(path, sample[has_header], separator, rows, has_header)
 
 
@@ -213,6 +219,14 @@ def _by_names(
     return table, stamp, position, quaternion, _unit_ns(rows, stamp) if unit is None else unit
 
 
+def _nanos_of(names: list[str], stamp: int) -> int | None:
+    """Return the column of nanoseconds that belongs to one of whole seconds, as ROS's stamps are written apart."""
+    *before, last = _words(names[stamp])
+    pairs = {"sec": ("nanosec", "nsec"), "secs": ("nsecs",), "s": ("ns",)}
+    wanted = [[*before, other] for other in pairs.get(last, ())]
+    return next((k for k, name in enumerate(names) if _words(name) in wanted), None)
+
+
 def _role(name: str) -> str:
     """Return "t", "px" to "pz", "qx" to "qw", or nothing, for what a column holds by its name."""
     words = _words(re.sub(r"[\[(].*", "", name))
@@ -256,6 +270,11 @@ def _by_numbers(
         return _Layout("stamp and matrix", separator, width, 0, matrix=1, unit_ns=unit_ns, header=header)
     if width == 4:
         return _Layout(f"stamp and position {kind}", separator, width, 0, (1, 2, 3), (), None, unit_ns, header)
+    if width == 7 and abs(first[0]) > _SINCE_1970_S and not _has_quaternion([["", *row] for row in rows]):
+        why = (
+            "7 numbers whose last four are no quaternion; if they are t x y z and angles, write above: # t x y z r p y"
+        )
+        raise DataError(f"{path}:{line}: {why} to take the positions")
     if width < 8 or not _has_quaternion(rows):
         raise DataError(f"{path}:{line}: {why_columns(width)}")
     w_first = separator is not None and (unit_ns != 1e9 or width == 17 or abs(first[4]) > 0.99)
@@ -341,6 +360,8 @@ def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int
         except ValueError as error:
             raise DataError(f"{path}:{number}: {error}") from error
         stamps.append("" if layout.stamp is None else fields[layout.stamp])
+        if layout.nanos is not None:
+            stamps[-1] += f".{fields[layout.nanos]:0>9}"
         lines.append(number)
     numbers = np.array(rows).reshape(-1, len(used))
     kept = ~np.isnan(numbers).all(axis=1) if layout.stamp is not None else np.ones(len(numbers), dtype=bool)

@@ -7,8 +7,6 @@ different ways. Neither focal length nor unit of depth have a part in it. Sensor
 narrow; ends on both sides are searched together, and what moves them apart is no offset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ and the lag of depth, as priors. The errors are in pixels: in units of the focal
 and it would run away. The unit of depth is no part of it: poses take it up (a similarity).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Finding a camera without a good prediction: P3P in RANSAC, and recognition of the keyframe by its descriptors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

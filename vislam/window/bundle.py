@@ -5,8 +5,6 @@ once: the states lie in a gravity-aligned frame whose yaw and origin are free, s
 are gravity's direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +16,7 @@ from vislam.core.camera import Rig
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, Observations
 from vislam.imu import ImuNoise, Preintegrated
-from vislam.window.calibration import Calibration
+from vislam.window.calibration import Calibration, optics_of
 from vislam.window.doubt import spreads
 from vislam.window.equations import (
     CALIBRATION,
@@ -135,7 +133,7 @@ def solve(
             break
         X, calibration = solution.X.copy(), solution.calibration
         errors = np.sqrt(solution.squares[:, 0]) * whitening
-        scatter = spreads(solution, selection.views) * whitening
+        scatter = spreads(solution, selection.views, len(rig.cameras)) * whitening
         sigma = float(scatter[0])
         whitening = sigma * problem.inflation
         tracks.remove_rows(selection.rows[errors > _OUTLIER * scatter[selection.views.camera]])
@@ -159,13 +157,12 @@ def _calibration_sigmas(problem: BundleProblem, config: WindowConfig, rig: Rig, 
 def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig, active: NDArray[np.bool_]) -> Camera:
     count = len(problem.T_world_body)
     return Camera(
-        T_body_cam=rig.T_body_cams[0],
-        T_cam0_cams=np.array([np.linalg.inv(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]]),
-        lenses=rig.lenses,
+        rig.T_body_cams[0],
+        *optics_of(rig),
         rate=np.zeros((count, 3)) if problem.rate_rad_s is None else problem.rate_rad_s,
         applied_offset_s=np.zeros(count),
         active=active,
-        huber_k=np.full(3, config.huber_k),
+        huber_k=np.full(len(rig.cameras) + 1, config.huber_k),
         rho_information=config.rho_sigma_1_m**-2,
     )
 

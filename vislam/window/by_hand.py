@@ -1,7 +1,5 @@
 """`Window`: a sliding window by hand, of tracks and inertial samples, without packets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -3,8 +3,6 @@
 The first is the test of `gate`; see there.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,18 +18,19 @@ _GATE_PROBABILITY = 0.999  # chi-square of an observation; above it after optimi
 _CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of wrong tracks, ...
 _LEAST_SPREAD = 0.05  # no tracker is better, a fit to few views only looks so
 _LEAST_VIEWS, _LEAST_TESTED = 3, 30  # of a landmark, and of all, before their scatter means anything
-_MEDIANS = 1.1774, 1.1774, 0.6745  # of the length of a normal error, in a plane and on a line
+_MEDIAN_PX, _MEDIAN_DEPTH = 1.1774, 0.6745  # of the length of a normal error, in a plane and on a line
 _STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expectation
 
 
 class Doubt:
     """Owns how often in a row hardly anything was as expected."""
 
-    def __init__(self) -> None:
-        """Start without any."""
+    def __init__(self, cameras: int) -> None:
+        """Start without any, for a number of cameras."""
         self._gate = chi_square_limit(_GATE_PROBABILITY, 2)
         self._contradictions = 0  # keyframes in a row
-        self.spreads = np.ones(3)  # see the function, at most 1: stated sigmas cover errors that neighbours share, too
+        # see the function, at most 1: stated sigmas cover errors that neighbours share, too
+        self.spreads = np.ones(cameras + 1)
 
     def newest(
         self, tracks: TrackTable, keyframes: Keyframes, covariance: Array, calibration: Array, camera: Camera
@@ -62,7 +61,7 @@ class Doubt:
 
     def solved(self, tracks: TrackTable, selection: Selection, solution: Solution) -> int:
         """Set `spreads`; take out views beyond the gate, and tracks with too many; return how many tracks."""
-        self.spreads = np.minimum(spreads(solution, selection.views), 1.0)
+        self.spreads = np.minimum(spreads(solution, selection.views, len(self.spreads) - 1), 1.0)
         bad: NDArray[np.bool_] = solution.squares.max(axis=1, initial=0.0) > self._gate
         if not bad.any():
             return 0
@@ -74,8 +73,8 @@ class Doubt:
         return int(hopeless.sum())
 
 
-def spreads(solution: Solution, views: Views) -> Array:
-    """Return the sigmas [3] of a pixel's error in either camera and of a depth's, whitened; 1 where few are seen.
+def spreads(solution: Solution, views: Views, cameras: int) -> Array:
+    """Return the sigmas [C + 1] of a pixel's error in each camera and of a depth's, whitened; 1 where few are seen.
 
     By medians, so that as many as half may be outliers. Views that a landmark and poses were fitted to scatter less;
     those of landmarks with fewer than three hardly at all, and do not count.
@@ -85,12 +84,7 @@ def spreads(solution: Solution, views: Views) -> Array:
     loosened = 1.0 / np.sqrt(np.repeat(1.0 - 1.5 / np.maximum(seen, _LEAST_VIEWS), seen) * poses)
     pixels, depths = (np.sqrt(solution.squares) * loosened[:, None]).T
     counts = np.repeat(seen >= _LEAST_VIEWS, seen)
-    groups = (
-        pixels[counts & (views.camera == 0)],
-        pixels[counts & (views.camera == 1)],
-        depths[counts & (views.values[:, 7] > 0.0)],
-    )
-    found = [
-        np.median(g) / usual if len(g) >= _LEAST_TESTED else 1.0 for g, usual in zip(groups, _MEDIANS, strict=True)
-    ]
+    groups = [(pixels[counts & (views.camera == c)], _MEDIAN_PX) for c in range(cameras)]
+    groups.append((depths[counts & (views.values[:, 7] > 0.0)], _MEDIAN_DEPTH))
+    found = [np.median(g) / usual if len(g) >= _LEAST_TESTED else 1.0 for g, usual in groups]
     return np.maximum(np.array(found), _LEAST_SPREAD)

@@ -29,6 +29,7 @@ from vislam.window.equations import (
     States,
     Views,
     hosted,
+    hosting,
     inertial,
     invert,
     linearised,
@@ -39,6 +40,7 @@ from vislam.window.equations import (
     residual,
     shift,
     sight,
+    through,
 )
 
 _MAX_RHO = 20.0  # 1/m: nothing is seen nearer than 5 cm
@@ -109,22 +111,22 @@ def innovations(
     scratch = np.empty((2, 2, width))
     first, hosts, keyframes, cameras, values = views
     cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
-    huber_k = camera.huber_k
+    huber_k, deep = camera.huber_k, len(camera.huber_k) - 1
     squares[:] = np.nan
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 5]
         own_block[:], cross[:] = 0.0, 0.0
         own_block[2, 2] = camera.rho_information
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
-        landmark = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
+        landmark = hosted(at_host, mount, hosting(cams, cameras[first[p]]), row, points[p, 0], points[p, 1], rho)
         for n in range(first[p], first[p + 1]):  # in order of time: the newest ones come last
-            k, view, cam = keyframes[n], measured(values, n), cams[cameras[n]]
+            k, view, cam = keyframes[n], measured(values, n), through(cams, cameras[n])
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
             if k != newest:
                 seen = sight(landmark, at, mount, cam)
                 ahead, error = residual(seen.in_cam, rho, view, cam)
                 if ahead:
-                    linearised(landmark, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
+                    linearised(landmark, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[deep]), J)
                     _add_older(J, view.depth_weight > 0.0, host, k, len(X), own_block, cross)
                 continue
             squares[n] = np.inf
@@ -174,7 +176,7 @@ def _best_depth(
     """Return the inverse depth that explains a view best, and J of it; NaN if none is in front of the camera."""
     rho = min(max(landmark.rho, 0.0), _MAX_RHO)
     for step in range(_DEPTH_STEPS + 1):
-        trial = hosted(landmark.place, mount, landmark.row, landmark.bearing[0], landmark.bearing[1], rho)
+        trial = hosted(landmark.place, mount, landmark.cam, landmark.row, landmark.bearing[0], landmark.bearing[1], rho)
         seen = sight(trial, at, mount, cam)
         ahead, error = residual(seen.in_cam, rho, view, cam)
         if not ahead:

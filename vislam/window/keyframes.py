@@ -1,7 +1,5 @@
 """The keyframes that a window holds: their states and what belongs to each, oldest first."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What leaves a window: observations with the oldest keyframe, so that none is used twice, and what is settled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 `local` is the window's own frame: gravity-aligned with an IMU, drifting like odometry, never moved by loops.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

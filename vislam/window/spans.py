@@ -1,7 +1,5 @@
 """What lies between keyframes: inertial spans made into links, with honest sigmas where data is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The observations that the window holds: a flat table, each row used once, ordered for the kernels on demand."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +63,11 @@ class TrackTable:
             if both.any():
                 place = np.cumsum(usable) - 1
                 self._append(slots[place[both]], keyframe_id, 1, right[both])
+        for further in seen.further:
+            camera, sigma_px = self._rig.cameras[further.camera], seen.noise * self._config.sigma_px
+            values = _rows_of(camera, further.pixels_px, sigma_px)
+            seen_well = np.asarray(np.isfinite(values).all(axis=1))
+            self._append(self._slots(further.track_ids[seen_well]), keyframe_id, further.camera, values[seen_well])
 
     def select(self, ids: Ints) -> Selection:
         """Return the views of all landmarks that two views or a depth fix; `ids` [M] are the window's keyframes."""
@@ -162,6 +165,9 @@ def check_observations(seen: Observations, where: str) -> None:
         raise DataError(f"{where}: a track is seen twice in one frame; track ids must be unique")
     if seen.right_px is not None and seen.right_px.shape != (count, 2):
         raise DataError(f"{where}: right pixels {seen.right_px.shape} for {count} tracks; use NaN for no match")
+    for further in seen.further:
+        if further.pixels_px.shape != (len(further.track_ids), 2) or not np.isfinite(further.pixels_px).all():
+            raise DataError(f"{where}: tracks of cam{further.camera} need one finite pixel each; leave others out")
     if seen.depth_m is not None and seen.depth_m.shape != (count,):
         raise DataError(f"{where}: depths of shape {seen.depth_m.shape} for {count} tracks; use NaN where unknown")
 

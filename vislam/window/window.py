@@ -8,39 +8,41 @@ leaves, the tracks that it saw give their first observations to the prior and go
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from vislam.config import MachineConfig, WindowConfig
 from vislam.core.camera import Rig
-from vislam.core.errors import UsageError
-from vislam.core.geometry import invert
-from vislam.core.messages import Array, KeyframePacket, NavState
+from vislam.core.errors import DataError, UsageError
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState
 from vislam.core.readings import Motion
 from vislam.imu import ImuNoise
 from vislam.window import gate
-from vislam.window.calibration import Calibration
+from vislam.window.calibration import Calibration, optics_of
 from vislam.window.doubt import Doubt
 from vislam.window.equations import (
     AXES,
+    STATE,
     Camera,
     Leaving,
     Prior,
     Problem,
     Room,
     Solution,
+    first_pose_prior,
+    first_prior,
     marginalise,
     optimise,
     touched,
     visual,
 )
-from vislam.window.incoming import Start, check_packet
 from vislam.window.keyframes import Keyframes
 from vislam.window.leaving import broken_off, settled, split
 from vislam.window.messages import WindowEdge, WindowGravity, WindowUpdate
-from vislam.window.posterior import Posterior, edges, nav_state, pose, scale_sigma
+from vislam.window.posterior import GAUGE_SIGMA_M, GAUGE_SIGMA_RAD, Posterior, edges, nav_state, pose, scale_sigma
 from vislam.window.spans import LinkStore
-from vislam.window.tracks import RHO_START, Selection, TrackTable
+from vislam.window.tracks import RHO_START, Selection, TrackTable, check_observations
 
 _UNKNOWN_SPEED_M_S = 0.5  # a velocity less certain than this predicts worse than odometry does
 _SURE_SPEED_M_S = 0.3  # until velocity is known so well, the window is still finding its feet:
@@ -48,6 +50,81 @@ _SURE_KEYFRAMES = 6  # nothing is rejected, calibration waits, and landmarks sta
 _SPLIT_MIN = 3  # observations a track gives to the marginal prior at once; the rest starts a new landmark
 _TOLERANCE = 5e-3  # relative decrease of the cost that ends Gauss-Newton steps; 1e-3 costs a step and gains nothing
 _UNSURE_EFFORT = 5  # times the iterations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """The first state of a window: a full one, or where there is no IMU its pose alone."""
+
+    state: NavState | None
+    T_local_body: Array  # [4, 4]
+
+    @classmethod
+    def of(cls, state: NavState | None, T_local_body: Array | None, has_imu: bool) -> Start:
+        """Return a start that was checked; DataError on numbers that cannot be used, UsageError on a missing state."""
+        if has_imu and state is None:
+            raise UsageError("a window with an IMU starts from a full state; initialise the inertial states first")
+        if state is not None:
+            _check_state(state)
+        if T_local_body is not None and not np.isfinite(T_local_body).all():
+            raise DataError("the first pose of the window is not finite; initialise again")
+        if has_imu and state is not None:
+            return cls(state, state.T_world_body)
+        return cls(None, np.eye(4) if T_local_body is None else T_local_body.copy())
+
+    def equations(self, calibration: Calibration) -> tuple[Array, Prior]:
+        """Return the state [21] of the first keyframe and the prior on it."""
+        x, start, gauge = np.zeros(STATE), self.state, (GAUGE_SIGMA_M, GAUGE_SIGMA_RAD)
+        x[:9], x[9:12] = self.T_local_body[:3, :3].ravel(), self.T_local_body[:3, 3]
+        if start is None:
+            return x, first_pose_prior(*gauge, calibration.values, calibration.start_sigmas)
+        x[12:15], x[15:18], x[18:21] = start.velocity_world_m_s, start.gyro_bias_rad_s, start.accel_bias_m_s2
+        return x, first_prior(start, *gauge, calibration.values, calibration.start_sigmas)
+
+
+def _check_state(state: NavState) -> None:
+    """Raise DataError unless a first state is finite and its covariance positive semidefinite."""
+    values = [state.T_world_body, state.velocity_world_m_s, state.gyro_bias_rad_s, state.accel_bias_m_s2]
+    if not all(np.isfinite(v).all() for v in values) or not np.isfinite(state.covariance).all():
+        raise DataError("the first state of the window is not finite; initialise again")
+    if float(np.linalg.eigvalsh(0.5 * (state.covariance + state.covariance.T))[0]) < -1e-9:
+        raise DataError("the covariance of the window's first state has a negative eigenvalue; initialise again")
+
+
+def check_packet(packet: KeyframePacket, T_odom_body: Array | None, newest: tuple[int, int] | None) -> None:
+    """Raise DataError unless a keyframe is finite and follows the newest one, of which id and time are given."""
+    where = f"keyframe {packet.keyframe.id} at {packet.keyframe.t_ns} ns"
+    check_observations(packet.observations, where)
+    if not np.isfinite(packet.time_offset_s):
+        raise DataError(f"{where}: its time offset is {packet.time_offset_s}; it must be a number of seconds")
+    if T_odom_body is not None and not np.isfinite(T_odom_body).all():
+        raise DataError(f"{where}: its pose by odometry is not finite; leave it out")
+    T_vo = packet.vo.T_keyframe_body
+    if T_vo is not None and not np.isfinite(T_vo).all():
+        raise DataError(f"{where}: its motion by visual odometry is not finite; report it as lost instead")
+    if newest is None:
+        return
+    newest_id, newest_t_ns = newest
+    if packet.keyframe.t_ns <= newest_t_ns or packet.keyframe.id <= newest_id:
+        raise DataError(
+            f"{where} does not follow keyframe {newest_id} at {newest_t_ns} ns; add keyframes in time order"
+        )
+    if packet.imu is not None:
+        _check_span(packet.imu, newest_t_ns, packet.keyframe.t_ns, where)
+
+
+def _check_span(span: ImuSpan, t0_ns: int, t1_ns: int, where: str) -> None:
+    if len(span.t_ns) == 0:
+        return
+    if not (np.isfinite(span.gyro_rad_s).all() and np.isfinite(span.accel_m_s2).all()):
+        raise DataError(f"{where}: its inertial span has values that are not finite; leave such samples out")
+    if len(span.t_ns) > 1 and int(np.diff(span.t_ns).min()) <= 0:
+        raise DataError(f"{where}: its inertial span goes back in time; sort the samples and drop duplicates")
+    if int(span.t_ns[0]) != t0_ns or int(span.t_ns[-1]) != t1_ns:
+        raise DataError(
+            f"{where}: its inertial span covers [{span.t_ns[0]}, {span.t_ns[-1]}] ns instead of [{t0_ns}, {t1_ns}]; "
+            "cut it with ImuBuffer.span"
+        )
 
 
 class SlidingWindow:
@@ -65,7 +142,7 @@ class SlidingWindow:
         self._rig = rig
         self._noise = noise
         self._measures_scale = rig.is_stereo or rig.has_depth
-        self._T_cam0_cams = np.array([invert(rig.T_body_cams[0]) @ T for T in rig.T_body_cams[:2]])
+        self._optics = optics_of(rig)
         self._links = LinkStore(config, noise, machine)
         self._room = Room()
         self._start: Start | None = None
@@ -115,7 +192,7 @@ class SlidingWindow:
         self._full = self._start is not None and self._start.state is not None  # with velocities and biases
         self._keyframes = Keyframes()
         self._calibration = Calibration(self._config, self._rig, self._noise if self._full else None, 0.0)
-        self._doubt = Doubt()
+        self._doubt = Doubt(len(self._rig.cameras))
         self._tracks = TrackTable(self._config, self._rig)
         self._links.clear()
         self._prior: Prior | None = None
@@ -171,9 +248,8 @@ class SlidingWindow:
         active, keyframes = self._calibration.wanted & self._sure, self._keyframes
         still = np.full(len(keyframes), self._calibration.values[0])  # the offset is then taken as applied
         return Camera(
-            T_body_cam=self._rig.T_body_cams[0],
-            T_cam0_cams=self._T_cam0_cams,
-            lenses=self._rig.lenses,
+            self._rig.T_body_cams[0],
+            *self._optics,
             rate=keyframes.rate_rad_s,
             applied_offset_s=keyframes.applied_offset_s if active[0] else still,
             active=active,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -36,13 +37,14 @@ class VisualNoise:
 
 
 def visual_factors(
-    tracks: Tracks, keep: Mask, with_depth: Mask, T_body_cam0: Array, noise: VisualNoise
+    tracks: Tracks, keep: Mask, with_depth: Mask, T_body_cams: Sequence[Array], noise: VisualNoise
 ) -> list[gtsam.NonlinearFactor]:
     """Return a projection factor per kept observation, a virtual stereo pair of 1 m baseline where it has depth.
 
     Its right column is x - rho, so its disparity is the inverse depth, and its noise that of x plus that of rho.
     """
-    T = gtsam.Pose3(T_body_cam0)
+    mounts = [gtsam.Pose3(T) for T in T_body_cams]
+    camera = tracks.image % max(len(mounts), 1)
     focal, disparity = tracks.focal, tracks.disparity
     K = gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
     K_stereo = gtsam.Cal3_S2Stereo(focal, focal, 0.0, 0.0, 0.0, disparity / focal)
@@ -57,7 +59,7 @@ def visual_factors(
         key = (int(steps[i]), int(depth_steps[i]) if with_depth[i] else None)
         if key not in models:
             models[key] = gtsam.noiseModel.Robust.Create(noise.kernel, _model(*key))
-        (x, y), a, b = pixels[i], X(int(tracks.keyframe[i])), L(int(tracks.point[i]))
+        (x, y), a, b, T = pixels[i], X(int(tracks.keyframe[i])), L(int(tracks.point[i])), mounts[camera[i]]
         if with_depth[i]:
             measured = gtsam.StereoPoint2(x, x - disparities[i], y)
             factors.append(gtsam.GenericStereoFactor3D(measured, models[key], a, b, K_stereo, False, False, T))

@@ -47,6 +47,7 @@ _PIXEL_SIGMA_MAX_PX = 3.0
 _MEDIAN_CHI2_2, _MEDIAN_CHI2_1 = 1.386, 0.455  # medians of chi-square with two degrees of freedom and with one
 _GLOBAL_S = 0.004  # a shorter readout than this counts as a global shutter: one that has none came out at 3.5 ms
 _MIN_LANDMARK_SEEN = 2  # keyframes
+_MAX_OBSERVATIONS = 400_000  # bounds memory (2 kB each in gtsam) and time; the longest tracks stay
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,8 +143,11 @@ class _Batch:
         count = len(self._chain.records)
         return np.array([nearest_rigid(self._values.atPose3(X(k)).matrix()) for k in range(count)])
 
-    def _cameras(self) -> Array:
-        return np.asarray(self._poses() @ self._T_body_cam0)
+    def _cameras(self, poses: Array | None = None) -> Array:
+        """Return the poses [K * C, 4, 4] of all images, at those of the body [K, 4, 4] if they are given."""
+        T_body_cams = np.array(self._log.rig.T_body_cams).reshape(-1, 4, 4)
+        poses = self._poses() if poses is None else poses
+        return (poses[:, None] @ T_body_cams).reshape(-1, 4, 4)
 
     def _judge(self, first: bool) -> None:
         """Triangulate every track again and decide which observations and depths count.
@@ -151,7 +155,7 @@ class _Batch:
         In the first round poses are the run's: what is grossly off leaves, the worst of a track before the rest is
         triangulated again.
         """
-        tracks, config, cameras = self._tracks, self._config, self._cameras()
+        tracks, cameras = self._tracks, self._cameras()
         candidates = np.ones(len(tracks), dtype=bool) if first else self._keep
         limit_px, limit_rho = (np.sqrt(chi_square_limit(_GATE_PROBABILITY, n)) for n in (2, 1))
         gate_px = _START_GATE_PX if first else self._sigma_px * limit_px
@@ -175,7 +179,7 @@ class _Batch:
         placed = triangulate(tracks, keep, cameras, self._sigma_px)
         good = (placed.relative_sigma < _MAX_RELATIVE_SIGMA) & (tracks.counts(keep) >= _MIN_LANDMARK_SEEN)
         keep = keep & good[tracks.point]
-        self._keep = _bounded(tracks, keep, config.max_observations)
+        self._keep = _bounded(tracks, keep, _MAX_OBSERVATIONS)
         self._points = placed.points_m
 
     def _optimise(self, first: bool) -> Solution:
@@ -212,7 +216,7 @@ class _Batch:
         shape, k = (estimators.Cauchy, _START_CAUCHY) if first else (estimators.Huber, self._config.huber_k)
         kernel = shape.Create(k / weaker)  # it bends where it would with the noise as it is
         noise = VisualNoise(weaker * self._sigma_px, weaker * self._depth_factor, kernel)
-        return visual_factors(tracks, self._keep, self._with_depth, self._T_body_cam0, noise)
+        return visual_factors(tracks, self._keep, self._with_depth, self._log.rig.T_body_cams, noise)
 
     def _calibrate(self) -> SharedErrors | None:
         """Return what the last factors at their solution show of focal length and metres; None without cameras."""
@@ -251,9 +255,10 @@ class _Batch:
         t_ns = np.array([record.t_ns for record in self._chain.records], dtype=np.int64)
         times = dict(enumerate(t_ns.tolist()))
         twists = camera_twists(self._log.frames.placed(times, dict(enumerate(poses))), t_ns, self._T_body_cam0)
-        error = residuals(tracks, self._points, poses @ self._T_body_cam0)
+        error = residuals(tracks, self._points, self._cameras(poses))
         if self._learns_readout:
-            left_s = readout_change_s(tracks, self._keep, error.xy, error.predicted_rho, twists)
+            of_first = self._keep & (tracks.image % len(self._log.rig.cameras) == 0)
+            left_s = readout_change_s(tracks, of_first, error.xy, error.predicted_rho, twists)
             self._readout_s = self._readout.next_s(self._readout_s, left_s)
         self._seen.moved_xy = self._applied_readout_s * shear(tracks, error.predicted_rho, twists)
 
@@ -305,7 +310,7 @@ class _Batch:
         """Return the cost of the last factors at the run's own states, with points triangulated from its poses."""
         tracks, count = self._tracks, len(self._chain.records)
         poses = np.array([start.atPose3(X(k)).matrix() for k in range(count)])
-        placed = triangulate(tracks, self._keep, poses @ self._T_body_cam0, self._sigma_px)
+        placed = triangulate(tracks, self._keep, self._cameras(poses), self._sigma_px)
         values = gtsam.Values(start)
         for key in self._own_keys:  # the run's own are not in its log
             values.update(key, self._values.atDouble(key))

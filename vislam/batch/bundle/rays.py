@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +25,7 @@ _UNKNOWN_INFORMATION = 1e-9  # 1/m^2, keeps the system of a track without parall
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Observations [N] of points [P] in keyframes, sorted by keyframe; coordinates are undistorted, on z = 1 of cam0.
+    """Observations [N] of points [P] in keyframes, sorted by keyframe; coordinates are undistorted, on z = 1.
 
     Depth is kept as inverse depth, whose noise does not grow with distance: of a depth image as it is, of a stereo pair
     from the disparity. A right pixel is found from the left one, so its own noise is that of the disparity, and what
@@ -32,6 +33,7 @@ class Tracks:
     """
 
     keyframe: Ints  # [N]
+    image: Ints  # [N] among those [I] whose poses are given; of a run's, keyframe * cameras + camera
     point: Ints  # [N]
     xy: Array  # [N, 2]
     sigma_per_px: Array  # [N] sigma of xy for a noise of one pixel
@@ -53,8 +55,10 @@ class Tracks:
 
 def collect(log: FactorLog, config: FrontEndConfig) -> Tracks:
     """Return all tracks that at least two keyframes saw; pixels that no ray of the camera gives are left out."""
-    parts = [_observed(i, k.packet.observations, log.rig, config) for i, k in enumerate(log.keyframes)]
-    keyframe = np.concatenate([part.keyframe for part in parts])
+    seen = [(i, k.packet.observations) for i, k in enumerate(log.keyframes)]
+    longer = replace(log.rig, cameras=tuple(c.with_focal(1.0 + _FOCAL_STEP) for c in log.rig.cameras))
+    parts = [part for i, one in seen for part in _observed(i, one, (log.rig, longer), config)]
+    keyframe, image = (np.concatenate([getattr(part, name) for part in parts]) for name in ("keyframe", "image"))
     ids = np.concatenate([part.ids for part in parts])
     xy, sigma = np.concatenate([part.xy for part in parts]), np.concatenate([part.sigma_per_px for part in parts])
     rho, sigma_rho = np.concatenate([part.rho for part in parts]), np.concatenate([part.sigma_rho for part in parts])
@@ -68,16 +72,17 @@ def collect(log: FactorLog, config: FrontEndConfig) -> Tracks:
     _, point = np.unique(ids[usable], return_inverse=True)
     count = int(point.max()) + 1 if len(point) else 0
     return Tracks(
-        keyframe[usable], point.astype(np.int64), xy[usable], sigma[usable], rho[usable], sigma_rho[usable],
-        row[usable], by_focal[usable], count,
+        keyframe[usable], image[usable], point.astype(np.int64), xy[usable], sigma[usable], rho[usable],
+        sigma_rho[usable], row[usable], by_focal[usable], count,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Observed:
-    """What one keyframe saw, one entry per track."""
+    """What a camera saw in one keyframe, one entry per track."""
 
     keyframe: Ints
+    image: Ints
     ids: Ints
     xy: Array
     sigma_per_px: Array
@@ -87,25 +92,37 @@ class _Observed:
     by_focal: Array
 
 
-def _observed(index: int, seen: Observations, rig: Rig, config: FrontEndConfig) -> _Observed:
+def _observed(index: int, seen: Observations, rigs: tuple[Rig, Rig], config: FrontEndConfig) -> Iterator[_Observed]:
+    """Yield what cameras but a right one saw, by `rigs` as given and with longer focal lengths; others at once."""
+    rig = rigs[0]
     if rig.is_blind:
         nothing, none = np.zeros(0), np.zeros(0, np.int64)
-        return _Observed(none, none, np.zeros((0, 2)), nothing, nothing, nothing, nothing, np.zeros((0, 3)))
-    n = len(seen.track_ids)
-    camera = rig.cameras[0]
-    xy, rho, sigma_rho = _calibrated(seen, rig, config)
-    longer = replace(rig, cameras=tuple(c.with_focal(1.0 + _FOCAL_STEP) for c in rig.cameras))
-    xy_longer, rho_longer, _ = _calibrated(seen, longer, config)
+        yield _Observed(none, none, none, np.zeros((0, 2)), nothing, nothing, nothing, nothing, np.zeros((0, 3)))
+        return
+    row = np.clip(seen.pixels_px[:, 1] / max(rig.cameras[0].height - 1.0, 1.0), 0.0, 1.0) - 0.5
+    yield _seen_by(0, index, seen, rigs, config, row)
+    for further in seen.further:
+        alone = Observations(further.track_ids, further.pixels_px)
+        yield _seen_by(further.camera, index, alone, rigs, config, np.zeros(len(further.track_ids)))
+
+
+def _seen_by(
+    number: int, index: int, seen: Observations, rigs: tuple[Rig, Rig], config: FrontEndConfig, row: Array
+) -> _Observed:
+    """Return what a camera saw in a keyframe; `row` [N] is where in the image, as in `Tracks`."""
+    rig, longer = rigs
+    camera, n = rig.cameras[number], len(seen.track_ids)
+    xy, rho, sigma_rho = _calibrated(camera, seen, rig, config)
+    xy_longer, rho_longer, _ = _calibrated(longer.cameras[number], seen, longer, config)
     by_focal = np.nan_to_num(np.column_stack([xy_longer - xy, rho_longer - rho])) / _FOCAL_STEP
     keyframe = np.full(n, index, dtype=np.int64)
-    row = np.clip(seen.pixels_px[:, 1] / max(camera.height - 1.0, 1.0), 0.0, 1.0) - 0.5
-    ids = seen.track_ids.astype(np.int64)
-    return _Observed(keyframe, ids, xy, angle_per_px(camera, xy), rho, sigma_rho, row, by_focal)
+    image, ids = keyframe * len(rig.cameras) + number, seen.track_ids.astype(np.int64)
+    return _Observed(keyframe, image, ids, xy, angle_per_px(camera, xy), rho, sigma_rho, row, by_focal)
 
 
-def _calibrated(seen: Observations, rig: Rig, config: FrontEndConfig) -> tuple[Array, Array, Array]:
-    """Return coordinates [N, 2], inverse depths [N] and their sigmas [N] as a rig gives them."""
-    xy = rig.cameras[0].normalise(seen.pixels_px)
+def _calibrated(camera: Camera, seen: Observations, rig: Rig, config: FrontEndConfig) -> tuple[Array, Array, Array]:
+    """Return coordinates [N, 2], inverse depths [N] and their sigmas [N] as a camera of a rig gives them."""
+    xy = camera.normalise(seen.pixels_px)
     if seen.right_px is not None and rig.is_stereo:
         return xy, *stereo_inverse_depth(rig, xy, seen.right_px, config.stereo_sigma_px)
     if seen.depth_m is None:
@@ -151,8 +168,8 @@ class Triangulation:
 
 
 def triangulate(tracks: Tracks, keep: Mask, T_map_cam: Array, sigma_px: float) -> Triangulation:
-    """Return points by weighted least squares of the kept observations [N], given the cameras [K, 4, 4]."""
-    k, p = tracks.keyframe[keep], tracks.point[keep]
+    """Return points by weighted least squares of the kept observations [N], given the images' poses [I, 4, 4]."""
+    k, p = tracks.image[keep], tracks.point[keep]
     R, centre = T_map_cam[k, :3, :3], T_map_cam[k, :3, 3]
     rays = np.column_stack([tracks.xy[keep], np.ones(len(k))])
     norm = np.linalg.norm(rays, axis=1)
@@ -204,8 +221,8 @@ class Residuals:
 
 
 def residuals(tracks: Tracks, points_m: Array, T_map_cam: Array) -> Residuals:
-    """Return the residuals of all observations at given points [P, 3] and cameras [K, 4, 4]."""
-    T = T_map_cam[tracks.keyframe]
+    """Return the residuals of all observations at given points [P, 3] and poses of images [I, 4, 4]."""
+    T = T_map_cam[tracks.image]
     seen = np.einsum("nji,nj->ni", T[:, :3, :3], points_m[tracks.point] - T[:, :3, 3])
     ahead = seen[:, 2] > _MIN_Z_M
     z = np.where(ahead, seen[:, 2], 1.0)

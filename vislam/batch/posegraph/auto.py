@@ -115,7 +115,9 @@ def _decide(
         + "".join(f"; {name} {0.5 * (j.objective - best.objective):.4g} below" for name, j in rivals[:2])
         + f"); variances of odometry {best.odometry_scale:.3g}, of loops {best.loop_scale:.3g} times those stated"
     )
-    return Decision(poses, kept.astype(np.float64), reason, undecided, _warning(problem, disputed, thin))
+    chance = f"chance may explain {best.supposed} of the loops kept, which agree with each other and few others"
+    warning = "; ".join(filter(None, (_warning(problem, disputed, thin), chance if best.supposed else "")))
+    return Decision(poses, kept.astype(np.float64), reason, undecided, warning)
 
 
 def _plain(structure: Structure, config: PoseGraphConfig, trusted: Mask, progress: Progress | None) -> Array | None:
@@ -192,7 +194,9 @@ def _solutions(
             continue
         tried.append(poses)
         _add(problem, settled, name, judge.settle(poses, kept))
-    return sorted(settled, key=lambda entry: (not np.any(entry[1].kept & ~trusted), entry[1].objective))
+    settled.sort(key=lambda entry: (not np.any(entry[1].kept & ~trusted), entry[1].objective))
+    settled[0] = (settled[0][0], judge.supposing(settled[0][1]))
+    return settled
 
 
 def _routes(

@@ -23,6 +23,7 @@ from vislam.batch.posegraph.isotropic import IsotropicGraph, Spectrum
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import levenberg_marquardt
 from vislam.batch.posegraph.staircase import Climb, climb
+from vislam.batch.posegraph.starts import harmonic_means
 from vislam.batch.posegraph.structure import Structure
 from vislam.batch.posegraph.symbolic import FACTOR_MAX_BYTES
 from vislam.core.messages import Array
@@ -148,8 +149,8 @@ def isotropic_weights(problem: PoseGraphProblem) -> tuple[Array, Array]:
     """
     d = problem.dimension
     k = d * (d - 1) // 2
-    tau = _harmonic_mean(problem.information[:, k:, k:])
-    kappa = _harmonic_mean(problem.information[:, :k, :k])
+    tau = harmonic_means(problem.information[:, k:, k:])
+    kappa = harmonic_means(problem.information[:, :k, :k])
     return (kappa if d == 2 else 0.5 * kappa), tau
 
 
@@ -179,22 +180,20 @@ def _bound(problem: PoseGraphProblem, poses: Array, kappa: Array, tau: Array) ->
 
 
 def _descended(problem: PoseGraphProblem, start: Array, poses: Array) -> Array:
-    """Return the minimum of chi2 that `start` leads to, the anchor of each part where `poses` have it."""
+    """Return the minimum of chi2 that `start` leads to, the anchor of each part where `poses` have it.
+
+    Where both have the same residuals, but for what is nothing beside their chi2, it leads to `poses`.
+    """
     ones, anchors = np.ones(len(problem.edges)), problem.anchors()
     labels = problem.components()
     held = np.empty(len(anchors), dtype=np.int64)
     held[labels[anchors]] = anchors
     moved = (poses[held] @ np.linalg.inv(start[held]))[labels] @ start
     moved[anchors] = poses[anchors]
+    off = problem.residuals(moved) - problem.residuals(poses)
+    if np.einsum("ea,eab,eb->", off, problem.information, off, optimize=True) <= _SAME * problem.chi2(poses):
+        return poses
     return levenberg_marquardt(Structure(problem), moved, ones, iterations=_STEPS, tolerance=_CONVERGED).poses
-
-
-def _harmonic_mean(W: Array) -> Array:
-    """Return the harmonic means [E] of the eigenvalues of matrices [E, m, m], 0 where one of them is."""
-    eigenvalues = np.linalg.eigvalsh(W)
-    singular = eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]
-    eigenvalues[singular] = 1.0
-    return np.where(singular, 0.0, W.shape[1] / np.sum(1.0 / eigenvalues, axis=1))
 
 
 def _tied(problem: PoseGraphProblem) -> int:

@@ -20,7 +20,7 @@ from vislam.core.messages import Array
 
 _ROUTINES = ("cython_blas.dtrsm", "cython_blas.dsyrk", "cython_lapack.dpotrf")
 _TRSM, _SYRK, _POTRF = range(3)
-_TOGETHER, _ROOM = 8, 8_000_000  # edges that are solved for at once, and numbers that this may take
+_TOGETHER = 8  # edges that are solved for at once
 _SMALL = 24  # pivots' columns up to which loops beat BLAS
 _SMALL_WORK = 40_000  # multiplications up to which they do
 
@@ -98,8 +98,11 @@ class Factor:
 
     def log_determinant(self) -> float:
         """Return the logarithm of the determinant of what was factorised last."""
-        return 2.0 * _log_diagonal(self.d, self.symbolic.first, self.symbolic.row_begin, self.symbolic.panel_begin,
-                                   self._panels)  # fmt: skip
+        s, d = self.symbolic, self.d
+        width, below = np.diff(s.first) * d, np.diff(s.row_begin) * d
+        column = np.arange(s.first[-1] * d) - np.repeat(s.first[:-1] * d, width)
+        at = np.repeat(s.panel_begin[:-1] * d * d, width) + column * np.repeat(width + below + 1, width)
+        return 2.0 * float(np.log(self._panels[at]).sum())
 
     def edge_covariances(self, ends: Ints, jacobians: Array) -> Array:
         """Return J @ A^-1 @ J^T [M, d, d] of pairs of free poses: J is jacobians [M, 2, d, d], by the ends' columns.
@@ -118,51 +121,50 @@ class Factor:
         return out
 
 
-@njit(cache=True, nogil=True)
-def _log_diagonal(d: int, first: Ints, row_begin: Ints, panel_begin: Ints, panels: Array) -> float:
-    total = 0.0
-    for f in range(len(first) - 1):
-        width = (first[f + 1] - first[f]) * d
-        height = width + (row_begin[f + 1] - row_begin[f]) * d
-        for j in range(width):
-            total += math.log(panels[panel_begin[f] * d * d + j * height + j])
-    return total
-
-
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _edge_covariances(
     d: int, fronts: _Fronts, front_of: Ints, panels: Array, places: Ints, transposed: Array, out: Array
 ) -> None:
-    """Solve L @ y = J^T of some edges at a time along their paths to the root, and sum y^T @ y up."""
+    """Solve L @ y = J^T of some edges at a time along their paths to the root, and sum y^T @ y up.
+
+    Of y there are the rows of the fronts on these paths alone, one front after the other.
+    """
     first, parent = fronts.first, fronts.parent
-    together = max(1, min(_TOGETHER, _ROOM // max(first[-1] * d * d, 1)))
-    y, visited = np.zeros((first[-1] * d, together * d)), np.zeros(len(parent), dtype=np.bool_)
-    for begin in range(0, len(places), together):
-        count, lowest = min(together, len(places) - begin), len(parent)
+    y, visited = np.zeros((0, _TOGETHER * d)), np.zeros(len(parent), dtype=np.bool_)
+    row = np.zeros(first[-1], dtype=np.int64)  # of each place in y, in blocks
+    for begin in range(0, len(places), _TOGETHER):
+        count, lowest, rows = min(_TOGETHER, len(places) - begin), len(parent), 0
+        for place in places[begin : begin + count].flat:
+            f = front_of[place]
+            while place >= 0 and f != -1 and not visited[f]:
+                visited[f] = True
+                lowest = min(lowest, f)
+                f = parent[f]
+        for f in range(lowest, len(parent)):
+            for at in range(first[f], first[f + 1] if visited[f] else first[f]):
+                row[at] = rows
+                rows += 1
+        if rows * d > len(y):
+            y = np.zeros((rows * d, _TOGETHER * d))
         for m in range(count):
             for end in range(2):
                 place = places[begin + m, end]
-                if place < 0:
-                    continue
-                y[place * d : (place + 1) * d, m * d : (m + 1) * d] += transposed[begin + m, end]
-                f = front_of[place]
-                lowest = min(lowest, f)
-                while f != -1 and not visited[f]:
-                    visited[f], f = True, parent[f]
+                if place >= 0:
+                    y[row[place] * d : (row[place] + 1) * d, m * d : (m + 1) * d] += transposed[begin + m, end]
         for f in range(lowest, len(parent)):
             if visited[f]:
                 visited[f] = False
-                _pass_front(d, fronts, f, panels, y[:, : count * d], out[begin : begin + count])
+                _pass_front(d, fronts, f, panels, row, y[:, : count * d], out[begin : begin + count])
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _pass_front(d: int, fronts: _Fronts, f: int, panels: Array, y: Array, out: Array) -> None:
+def _pass_front(d: int, fronts: _Fronts, f: int, panels: Array, row: Ints, y: Array, out: Array) -> None:
     """Solve for a front's pivots, take them from the rows beneath, and add what they give to `out`."""
     first, row_begin = fronts.first, fronts.row_begin
     width = (first[f + 1] - first[f]) * d
     height = width + (row_begin[f + 1] - row_begin[f]) * d
     panel = panels[fronts.panel_begin[f] * d * d : fronts.panel_begin[f + 1] * d * d]
-    own = y[first[f] * d : first[f + 1] * d]
+    own = y[row[first[f]] * d : row[first[f]] * d + width]
     for j in range(width):
         column, known = panel[j * height : (j + 1) * height], own[j]
         for c in range(len(known)):
@@ -179,7 +181,7 @@ def _pass_front(d: int, fronts: _Fronts, f: int, panels: Array, y: Array, out: A
         p, q, s = own[j], own[j + 1], own[j + 2]
         for r in range(row_begin[f], row_begin[f + 1]):
             for i in range(d):
-                goal, at = y[fronts.rows[r] * d + i], j * height + width + (r - row_begin[f]) * d + i
+                goal, at = y[row[fronts.rows[r]] * d + i], j * height + width + (r - row_begin[f]) * d + i
                 u, v, w = panel[at], panel[at + height], panel[at + 2 * height]
                 for c in range(len(p)):
                     goal[c] -= u * p[c] + v * q[c] + w * s[c]

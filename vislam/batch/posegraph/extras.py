@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vislam.batch.posegraph.parts import EdgeLines, PoseLines, poses_from_angles, poses_from_quaternions, symmetric
 from vislam.batch.posegraph.problem import Ids, Mask, PoseGraphProblem
+from vislam.batch.posegraph.structure import adjoints
 from vislam.batch.posegraph.tagged_lines import Rows
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert_many, quaternion_xyzw_from_rotation
@@ -203,17 +204,15 @@ def _positions(rows: Rows, observed: bool, wants_point: bool) -> _Columns:
 def _priors_2d(rows: Rows) -> _Columns:
     Z = poses_from_angles(rows.numbers[:, :2], rows.numbers[:, 2])
     W = symmetric(rows.numbers[:, 3:], _ORDER_2D)
-    return _priors(rows, Z, W, _is_empty(W[:, :1]))
+    return _priors(rows, Z, W, np.abs(W[:, :1]).sum(axis=(1, 2)) == 0.0)
 
 
 def _priors_3d(path: Path, rows: Rows, offsets: dict[int, Array]) -> _Columns:
     Z = poses_from_quaternions(path, rows.numbers[:, :3], rows.numbers[:, 3:7], rows.lines)
     W = symmetric(rows.numbers[:, 7:], _ORDER_3D)
     back = invert_many(_offsets_of(path, offsets, rows.ids[:, 1], rows.lines))
-    A = np.zeros((len(back), 6, 6))  # adjoints of P^-1, rotation first
-    A[:, :3, :3] = A[:, 3:, 3:] = back[:, :3, :3]
-    A[:, 3:, :3] = np.cross(back[:, None, :3, 3], back[:, :3, :3], axisa=2, axisb=1, axisc=1)
-    priors = _priors(rows, Z @ back, A.transpose(0, 2, 1) @ W @ A, _is_empty(W[:, :3]))
+    A = adjoints(back)
+    priors = _priors(rows, Z @ back, A.transpose(0, 2, 1) @ W @ A, np.abs(W[:, :3]).sum(axis=(1, 2)) == 0.0)
     levers = priors["is_position"]
     moved = levers & back[:, :3, 3].any(axis=1)
     if moved.any():
@@ -233,11 +232,6 @@ def _priors(rows: Rows, Z: Array, W: Array, is_position: Mask) -> _Columns:
         "to": rows.ids[:, 0], "observer": np.full(count, -1), "wants_point": np.full(count, False), "measurements": Z,
         "information": W, "is_position": is_position, "lines": rows.lines,
     }  # fmt: skip
-
-
-def _is_empty(rows: Array) -> Mask:
-    """Return which [M] of some rows [M, r, k] of matrices are zero."""
-    return np.array([not W.any() for W in rows], dtype=np.bool_)
 
 
 def _shifted(path: Path, edges: _Columns, offsets: dict[int, Array], ids: Ids) -> _Columns:

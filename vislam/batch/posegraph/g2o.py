@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,14 @@ from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.tagged_lines import Rows, TaggedLines, read_tagged_lines
 from vislam.core.collector import paused
 from vislam.core.errors import DataError
-from vislam.core.files import write_text
+from vislam.core.files import write_lines
 from vislam.core.messages import Array
 
 _POSE_2D, _POSE_3D, _EDGE_2D, _EDGE_3D = "VERTEX_SE2", "VERTEX_SE3:QUAT", "EDGE_SE2", "EDGE_SE3:QUAT"
 _COLUMNS = {_POSE_2D: (1, 3), _POSE_3D: (1, 7), _EDGE_2D: (2, 9), _EDGE_3D: (2, 28)}
 _PASSED = {"PARAMS_SE2OFFSET": 4}  # tag: fields behind it
 _POSE_DIGITS = {True: " ".join(["%.15g"] * 3), False: " ".join(["%.15g"] * 7)}
+_EDGES_AT_ONCE = 4096
 _ORDER_2D, _ORDER_3D = (2, 0, 1), (3, 4, 5, 0, 1, 2)  # files have translation first
 
 
@@ -84,35 +86,38 @@ def write_g2o(problem: PoseGraphProblem, path: Path, poses: Array | None = None)
     Poses without a value are left out. The file appears whole or not at all. Raises StorageError.
     """
     values = problem.poses if poses is None else poses
-    known = ~np.isnan(values[:, 0, 0]) & problem.is_pose
-    two = problem.dimension == 2
-    parts: list[str] = list(problem.passed_lines)
+    fixed = problem.fixed & (problem.is_pose | problem.is_point)
+    lines = (
+        problem.passed_lines, _pose_lines(problem, values), extra_vertices(problem, values),
+        (f"FIX {i}" for i in problem.ids[fixed].tolist()), extra_edges(problem), _edge_lines(problem),
+    )  # fmt: skip
+    write_lines(path, chain.from_iterable(lines))
+
+
+def _pose_lines(problem: PoseGraphProblem, values: Array) -> Iterator[str]:
+    two, known = problem.dimension == 2, ~np.isnan(values[:, 0, 0]) & problem.is_pose
     row = f"{_POSE_2D if two else _POSE_3D} %d {_POSE_DIGITS[two]}"
     for i, numbers in zip(problem.ids[known].tolist(), pose_numbers(values[known]).tolist(), strict=True):
-        parts.append(row % (i, *numbers))
-    parts += extra_vertices(problem, values)
-    fixed = problem.fixed & (problem.is_pose | problem.is_point)
-    parts += (f"FIX {i}" for i in problem.ids[fixed].tolist())
-    parts += extra_edges(problem)
-    parts += _edge_lines(problem, f"{_EDGE_2D if two else _EDGE_3D} %d %d {_POSE_DIGITS[two]} %s")
-    write_text(path, "\n".join(parts) + "\n")
+        yield row % (i, *numbers)
 
 
-def _edge_lines(problem: PoseGraphProblem, row: str) -> Iterator[str]:
-    order = _ORDER_2D if problem.dimension == 2 else _ORDER_3D
-    back = np.argsort(order)
+def _edge_lines(problem: PoseGraphProblem) -> Iterator[str]:
+    two = problem.dimension == 2
+    row, back = (
+        f"{_EDGE_2D if two else _EDGE_3D} %d %d {_POSE_DIGITS[two]} %s",
+        np.argsort(_ORDER_2D if two else _ORDER_3D),
+    )
     a, b = np.triu_indices(problem.tangent)
-    own = np.flatnonzero(~problem.is_position & (problem.edges[:, 0] != problem.world))
-    upper = problem.information[own][:, back[a], back[b]]
     digits = " ".join(["%.15g"] * len(a))
     texts: dict[bytes, str] = {}  # most files repeat a few matrices
-    ends, measured = problem.ids[problem.edges[own]].tolist(), pose_numbers(problem.measurements[own]).tolist()
-    stated, size = upper.tobytes(), upper.itemsize * len(a)
-    matrices = [stated[at : at + size] for at in range(0, len(stated), size)]
-    for (i, j), numbers, matrix in zip(ends, measured, matrices, strict=True):
-        if matrix not in texts:
-            texts[matrix] = digits % tuple(np.frombuffer(matrix).tolist())
-        yield row % (i, j, *numbers, texts[matrix])
+    own = np.flatnonzero(~problem.is_position & (problem.edges[:, 0] != problem.world))
+    for at in np.split(own, range(_EDGES_AT_ONCE, len(own), _EDGES_AT_ONCE)):
+        ends, measured = problem.ids[problem.edges[at]].tolist(), pose_numbers(problem.measurements[at]).tolist()
+        for (i, j), numbers, upper in zip(ends, measured, problem.information[at][:, back[a], back[b]], strict=True):
+            matrix = upper.tobytes()
+            if matrix not in texts:
+                texts[matrix] = digits % tuple(upper.tolist())
+            yield row % (i, j, *numbers, texts[matrix])
 
 
 def _poses_3d(path: Path, rows: Rows) -> Array:

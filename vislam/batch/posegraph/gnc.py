@@ -13,12 +13,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.batch.posegraph.noise import covariances_of_edges
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import Progress, levenberg_marquardt
 from vislam.batch.posegraph.starts import odometry_start
-from vislam.batch.posegraph.structure import NormalEquations, Structure, adjoints
+from vislam.batch.posegraph.structure import Structure
 from vislam.core.chi_square import chi_square_limit
-from vislam.core.geometry import invert_many
 from vislam.core.messages import Array
 
 Mask = NDArray[np.bool_]
@@ -133,19 +133,8 @@ def _tested(
     structure: Structure, problem: PoseGraphProblem, poses: Array, edges: NDArray[np.int64]
 ) -> tuple[Array, Array]:
     """Return squared Mahalanobis distances of edges not in the structure, and the log-density at distance zero."""
-    k = problem.tangent
-    factor = structure.factor(k)
-    equations = NormalEquations(structure, factor)
-    equations.linearise(poses, np.ones(len(structure.problem.edges)))
-    if not equations.factorise(1e-9):
-        return np.full(len(edges), np.inf), np.full(len(edges), -np.inf)
-    ends = problem.edges[edges]
-    jacobians = np.empty((len(edges), 2, k, k))
-    jacobians[:, 1] = np.eye(k)
-    jacobians[:, 0] = -adjoints(
-        invert_many(poses[ends[:, 1]]) @ poses[ends[:, 0]]
-    )  # with Jr(r) = I: false loops are far off
-    S = factor.edge_covariances(structure.index[ends], jacobians)
+    k, ones = problem.tangent, np.ones(len(structure.problem.edges))
+    S, _ = covariances_of_edges(structure, problem, poses, ones, edges, np.zeros(len(edges), dtype=np.bool_))
     information = problem.information[edges]
     floor = _LEAST_INFORMATION * np.einsum("eii->e", information)
     innovation = S + np.linalg.inv(information + floor[:, None, None] * np.eye(k))

@@ -12,6 +12,7 @@ their headings would be off by more than half a turn, which is meaningless: that
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -41,7 +42,7 @@ from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_line
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
 from vislam.batch.posegraph.tagged_lines import Rows, read_tagged_lines
 from vislam.core.errors import DataError, UsageError
-from vislam.core.files import write_text
+from vislam.core.files import write_lines
 from vislam.core.messages import Array
 
 _EDGES_2D = ("ODOMETRY", "EDGE2", "Constraint2")
@@ -131,9 +132,8 @@ def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None
         ) from error
     a, b = np.triu_indices(problem.tangent)
     two = problem.dimension == 2
-    lines = [] if two else list(pose_lines(problem, poses, "POSE3D_INIT"))
-    lines += edge_lines(problem, R[:, a, b], "EDGE2" if two else "EDGE3")
-    write_text(path, "\n".join([*lines, *places]) + "\n")
+    starts = () if two else pose_lines(problem, poses, "POSE3D_INIT")
+    write_lines(path, chain(starts, edge_lines(problem, R[:, a, b], "EDGE2" if two else "EDGE3"), places))
 
 
 def _joined(parts: list[Rows]) -> Rows:

@@ -26,6 +26,7 @@ from vislam.core.messages import Array
 
 _STEPS = 100  # from a minimum of chi2 three to six are enough
 _CONVERGED = 1e-14  # of the cost: what a step still promises; further ones drown in rounding
+_NEAR = 1e-8  # of the cost: where a step promises less, the factor of the step before serves the next ones
 _DAMPING = 1e-4  # of the diagonal, where the plain step fails
 _MAX_DAMPING = 1e8
 _ROUNDING = 1e-13  # of the largest entry: below, a pivot of the factorisation may be negative by rounding alone
@@ -84,18 +85,17 @@ class IsotropicGraph:
 
     def minimise(self, poses: Array) -> Array:
         """Return the poses at the local minimum that Newton's method reaches from these."""
-        poses, cost, damping = poses.copy(), self.value(poses), 0.0
+        poses, cost, damping, promised = poses.copy(), self.value(poses), 0.0, np.inf
         factor = Factor(self._symbolic, len(self._motions))
         for _ in range(_STEPS):
             force = self.force(poses[:, : self._d])
             gradient = self._along_motions(poses, force)
-            curved = self._diagonal.copy()
-            curved[:, : self._d, : self._d] -= self._multipliers(poses[:, : self._d], force)
-            blocks = self._projected(poses, curved)
-            if damping > 0.0 or not factor.factorise(*blocks):  # Newton's matrix is indefinite far from a minimum
-                blocks = self._projected(poses, self._diagonal)
-                damping = max(damping, _DAMPING)
-            step, promised, better, better_cost = None, 0.0, poses, np.inf
+            if damping > 0.0 or promised > _NEAR * cost:
+                blocks = self._projected(poses, self._certificate(poses[:, : self._d], force))
+                if damping > 0.0 or not factor.factorise(*blocks):  # Newton's matrix is indefinite far from a minimum
+                    blocks = self._projected(poses, self._diagonal)
+                    damping = max(damping, _DAMPING)
+            promised, better, better_cost = 0.0, poses, np.inf
             while True:
                 if damping == 0.0 or factor.factorise(_damped(blocks[0], damping), blocks[1]):
                     step = factor.solve(-gradient)
@@ -122,8 +122,7 @@ class IsotropicGraph:
     def lifted_spectrum(self, X: Array) -> Spectrum:
         """Return the low end of the spectrum of the certificate matrix at X [N, r, d + 1]."""
         d, n = self._d, len(X)
-        S = self._diagonal.copy()
-        S[:, :d, :d] -= self._multipliers(X, self.force(X))
+        S = self._certificate(X, self.force(X))
         scale = float(np.abs(S[:, range(d), range(d)]).max())
         S[self._pinned, d, d] *= 2.0  # holds the translation of each part; costs nothing, as S does not see it
         rounding = _ROUNDING * scale
@@ -188,11 +187,19 @@ class IsotropicGraph:
 
     def _residuals(self, X: Array) -> Array:
         """Return X_j - X_i Z [E, r, d + 1]."""
-        return X[self._edges[:, 1]] - X[self._edges[:, 0]] @ self._Z
+        out = X[self._edges[:, 1]]
+        out -= X[self._edges[:, 0]] @ self._Z
+        return out
 
     def _multipliers(self, X: Array, force: Array) -> Array:
         L = X[:, :, : self._d].transpose(0, 2, 1) @ force[:, :, : self._d]
         return 0.5 * (L + L.transpose(0, 2, 1))
+
+    def _certificate(self, X: Array, force: Array) -> Array:
+        """Return the diagonal blocks [N, d + 1, d + 1] of the certificate matrix at X [N, r, d + 1]."""
+        S = self._diagonal.copy()
+        S[:, : self._d, : self._d] -= self._multipliers(X, force)
+        return S
 
     def _along_motions(self, poses: Array, force: Array) -> Array:
         """Return the gradient [N, k] of half the cost by body-side tangents."""

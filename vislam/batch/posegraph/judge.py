@@ -13,7 +13,7 @@ many they are, they weigh as one, and a place that was seen often does not outwe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ _KNOWN = 10.0  # information times the square of the space's spread: below, a di
 _TAILS = 4.0  # times the chi-square limit: errors of real loops have heavier tails than a Gaussian
 _WORST = 0.3  # of the worst score: the loops that leave with it; a bad one makes its neighbours look bad
 _ODDS = math.log(3.0)  # a loop is believed that is three times likelier true than false: a false one harms more
+_SUPPOSED_MAX = 4  # loops, one after the other, that chance might explain as well
 _BACK = 2.0  # log-odds more for every time that it was taken back
 _BORDER = 1.0  # log-odds: covariances of loops nearer to a decision are computed in every round
 _CHANGED = 0.05  # of the loops kept: as many changes, and those of all are
@@ -43,7 +44,8 @@ _SETTLED = 0.2  # of the logarithm of a scale
 _SCALE_MIN, _ODOMETRY_SCALE_MAX, _LOOP_SCALE_MAX = 1e-10, 4.0, 1.0
 _LOOPS_BETTER = 0.1  # of odometry's scale: less shows loops that were made of odometry, or agree by chance
 _SHARE_MIN = 0.1  # redundancy of odometry over its numbers: below, loops say little about its noise
-_REDUNDANCY_MIN = 5.0
+_REDUNDANCY_MIN = 30.0  # numbers, to show the scale of odometry
+_JUDGED_MIN = 5  # loops, to show theirs
 _LEVERAGE_MAX = 1.0 - 1e-9
 _ITERATIONS, _TOLERANCE = 10, 1e-5
 _PLACE_WAY = 0.05  # of the extent: as far along the way a place reaches
@@ -62,6 +64,7 @@ class Judgement:
     objective: float  # minus twice the logarithm of the marginal likelihood: lower explains more
     evidence: Array  # [E] log-odds that an edge is true; inf of those trusted
     leverage: Array  # [E] share of a kept loop in its own estimate: near 1 nothing else confirms it; 0: left out
+    supposed: int = 0  # loops that were let in before anything spoke for them
 
 
 class Judge:
@@ -84,13 +87,36 @@ class Judge:
         self._limit = _TAILS * chi_square_limits(probability, np.maximum(self._dof, 1))
         self._medians = chi_square_limits(0.5, np.maximum(self._dof, 1))
 
-    def settle(self, poses: Array, kept: Mask) -> Judgement:
-        """Return what letting in and taking back ends with, from poses [N, d + 1, d + 1] and edges kept [E]."""
+    def supposing(self, found: Judgement) -> Judgement:
+        """Return what a settled solution grows to where loops are supposed true that nothing decides about.
+
+        Several may agree with each other. So the likeliest left out is let in, one after the other.
+        """
+        first = supposed = found
+        for _ in range(_SUPPOSED_MAX):
+            evidence = np.where(supposed.kept, -np.inf, supposed.evidence)
+            if evidence.max() <= 0.0:
+                break
+            kept = supposed.kept.copy()
+            kept[np.argmax(evidence)] = True
+            supposed = self.settle(supposed.poses, kept, 0)
+            if supposed.objective >= found.objective:
+                break
+            settled = self.settle(supposed.poses, kept)
+            if settled.objective < found.objective:
+                found = supposed = settled
+        return replace(found, supposed=int(np.count_nonzero(found.kept & ~first.kept)))
+
+    def settle(self, poses: Array, kept: Mask, rounds: int = _ROUNDS_MAX) -> Judgement:
+        """Return what letting in and taking back ends with, from poses [N, d + 1, d + 1] and edges kept [E].
+
+        After no rounds that is the edges kept, judged.
+        """
         scales, level, changed, at = (1.0, 1.0), 0, 0, self._loops
         S, judged_with = np.zeros((len(at), len(self._spread), len(self._spread))), scales
         stale, score, share = np.ones(len(at), dtype=np.bool_), np.zeros(len(at)), np.zeros(len(at))
         times_out = np.zeros(len(at))
-        for _ in range(_ROUNDS_MAX):
+        for left in range(rounds, -1, -1):
             structure, poses, scales = self._calibrated(poses, kept, scales)
             if _apart(scales, judged_with) > _SETTLED or changed > _CHANGED * kept[at].sum():
                 stale[:], changed, judged_with = True, 0, scales
@@ -102,8 +128,8 @@ class Judge:
             enters = np.zeros(len(at), dtype=np.bool_)
             if leaves.sum() <= max(1, 0.01 * inside.sum()):
                 enters, level = _entering(inside, score - _BACK * times_out, level)
-            if not np.any(leaves | enters):
-                if was_fresh or changed == 0:
+            if left == 0 or not np.any(leaves | enters):
+                if left == 0 or was_fresh or changed == 0:
                     break
                 changed, stale[:] = 0, True
                 continue
@@ -201,7 +227,7 @@ class Judge:
         if float(free[trusted].sum()) > max(_REDUNDANCY_MIN, _SHARE_MIN * float(dof[trusted].sum())):
             odometry *= float(np.sum(z[trusted] ** 2)) / float(free[trusted].sum())
         judged = ~trusted & (free >= 0.5 * dof)
-        if judged.sum() > _REDUNDANCY_MIN:
+        if judged.sum() > _JUDGED_MIN:
             studentised = _studentised(z[judged], L[judged], counts_for[judged])[0]
             loops *= float(np.median(studentised / self._medians[edges][judged]))
         return (

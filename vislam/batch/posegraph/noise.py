@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.batch.posegraph.cholesky import Factor
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
 from vislam.batch.posegraph.structure import NormalEquations, Structure, adjoints
 from vislam.core.errors import UsageError
@@ -37,7 +38,7 @@ class NoiseOfKind:
     numbers: int  # measured ones, those without information not counted
     chi2: float
     redundancy: float  # degrees of freedom
-    factor: float  # variances are this many times those stated; nan where the redundancy is too small for it
+    factor: float  # variances are this many times those stated; nan where the redundancy is too small
     applied: float  # the factor that variances were multiplied by, 1 without --rescale-noise
 
     @property
@@ -52,21 +53,23 @@ class NoiseOfKind:
 
 
 def covariances_of_edges(
-    structure: Structure, problem: PoseGraphProblem, poses: Array, weights: Array, edges: Ids, inside: Mask
-) -> tuple[Array, float]:
+    structure: Structure, problem: PoseGraphProblem, poses: Array, weights: Array, edges: Ids, inside: Mask,
+    factor: Factor | None = None,
+) -> tuple[Array, float]:  # fmt: skip
     """Return covariances [M, k, k] of the relative poses of `edges` (of `problem`), and the log-determinant of H.
 
     H are the normal equations of the structure's own problem at poses, its edges weighted by `weights`. Covariances are
     on the body side of the later end; of edges `inside` [M], which the structure has, of the error r itself, for where
-    nothing else confirms a loop its redundancy is what rounding leaves of the difference between the two. Raises
-    UsageError where the factor does not fit into memory.
+    nothing else confirms a loop its redundancy is what rounding leaves of the difference between the two. `factor`:
+    that of H, where it is there already. Raises UsageError where it does not fit into memory.
     """
     k = problem.tangent
-    factor = structure.factor(k)
-    equations = NormalEquations(structure, factor)
-    equations.linearise(poses, weights)
-    if not equations.factorise(1e-12) and not equations.factorise(1e-8):
-        raise UsageError("the edges leave poses undetermined, so their noise cannot be judged; give them information")
+    if factor is None:
+        factor = structure.factor(k)
+        equations = NormalEquations(structure, factor)
+        equations.linearise(poses, weights)
+        if not equations.factorise(1e-12) and not equations.factorise(1e-8):
+            raise UsageError("the edges leave poses undetermined: their noise cannot be judged; give them information")
     ends = problem.edges[edges]
     jacobians = np.empty((len(ends), 2, k, k))
     jacobians[:, 1] = np.eye(k)
@@ -92,22 +95,25 @@ def _right_jacobian_inverse(r: Array) -> Array:
     return np.eye(k) + 0.5 * ad + square / 12.0 - fourth / 720.0 + fourth @ square / 30240.0
 
 
-def noise_of_kinds(problem: PoseGraphProblem, poses: Array, weights: Array | None = None) -> tuple[NoiseOfKind, ...]:
+def noise_of_kinds(
+    problem: PoseGraphProblem, poses: Array, weights: Array | None = None, factor: Factor | None = None
+) -> tuple[NoiseOfKind, ...]:
     """Return what the edges with weight show at poses [N, d + 1, d + 1], the optimum: four kinds, those that exist.
 
     Chi-square is that of all edges, of redundancies the mean of as many as take about the time of the solution, every
-    n-th of a kind. Raises UsageError where the factor does not fit.
+    n-th of a kind. `factor`: as of `covariances_of_edges`. Raises UsageError where it does not fit.
     """
     used = np.arange(len(problem.edges)) if weights is None else np.flatnonzero(weights > 0.0)
     if not len(used):
         return ()
     structure = Structure(problem.with_edges(used))
-    most = int(np.clip(structure.symbolic.affordable(), _SAMPLE_MIN, _SAMPLE_MAX))
+    symbolic = structure.symbolic if factor is None else factor.symbolic
+    most = int(np.clip(symbolic.affordable(), _SAMPLE_MIN, _SAMPLE_MAX))
     is_odometry = np.abs(problem.edges[:, 1] - problem.edges[:, 0]) == 1
     kinds = {"odometry": used[is_odometry[used]], "loops": used[~is_odometry[used]]}
     sample = np.concatenate([spread_out(edges, most) for edges in kinds.values()])
     inside = np.ones(len(sample), dtype=np.bool_)
-    S, _ = covariances_of_edges(structure, problem, poses, np.ones(len(used)), sample, inside)
+    S, _ = covariances_of_edges(structure, problem, poses, np.ones(len(used)), sample, inside, factor)
     W, r = problem.information, problem.residuals(poses)
     turn = problem.tangent - problem.dimension
     measured = np.diagonal(W, axis1=1, axis2=2) > np.where(np.arange(problem.tangent) < turn, _ANY_HEADING, 0.0)
@@ -124,8 +130,8 @@ def noise_of_kinds(problem: PoseGraphProblem, poses: Array, weights: Array | Non
             share = float(taken[of_kind, columns].sum()) / max(int(measured[sample[of_kind], columns].sum()), 1)
             redundancy = max(numbers * (1.0 - share), 0.0)
             is_enough = redundancy >= max(_REDUNDANCY_MIN, _SHARE_MIN * numbers)
-            factor = max(total / redundancy, _TINY) if is_enough else float("nan")
-            found.append(NoiseOfKind(f"{name} {part}", len(edges), numbers, total, redundancy, factor, 1.0))
+            times = max(total / redundancy, _TINY) if is_enough else float("nan")
+            found.append(NoiseOfKind(f"{name} {part}", len(edges), numbers, total, redundancy, times, 1.0))
     return tuple(found)
 
 

@@ -1,4 +1,4 @@
-"""A pose graph optimised: where to start, by which method, and which edges to believe."""
+"""A pose graph optimised: where to start, and which edges to believe."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ def optimize_pose_graph(
     progress: Progress | None = None,
     team: Team | None = None,
 ) -> PoseGraphSolution:
-    """Return the poses of lowest chi2 (see `PoseGraphProblem`) that the method finds from the chosen start.
+    """Return the poses of lowest chi2 (see `PoseGraphProblem`) found from the chosen start.
 
     One pose of each connected part keeps its value, fixed poses all do. Deterministic. Raises DataError when the graph
-    has no finite cost anywhere or the method fails, UsageError for a start that the graph cannot have, and where the
+    has no finite cost anywhere, UsageError for a start that the graph cannot have, and where the
     search for false edges needs a factor that does not fit. `team`: who solves the graph by overlapping domains; None:
     it is solved as a whole.
     """
@@ -87,7 +87,8 @@ def optimize_pose_graph(
     )
     labels, descent = kept.components(), plain.descent
     parts = int(labels.max(initial=-1)) + 1
-    notes = [*problem.notes, *_of_landmarks(problem, descent.poses, weights)]
+    free = undetermined_landmarks(problem, descent.poses, weights) if problem.is_point.any() else problem.ids[:0]
+    notes = [*problem.notes, *([undetermined_message(free)] if len(free) else [])]
     if config.robust != "auto":
         notes += _of_loops(problem, descent.poses, weights, config.inlier_probability)
     if decision is not None and decision.warning:
@@ -97,7 +98,7 @@ def optimize_pose_graph(
     if parts > 1:
         notes.append(f"{parts} parts that no edge joins, each with a pose of its own that keeps its value")
     if not descent.converged:
-        notes.append("not converged: give more --iterations, another --start or --method")
+        notes.append("not converged: give more --iterations or another --start")
     return PoseGraphSolution(
         descent.poses, plain.start, plain.start_name, plain.start_costs, descent.costs, descent.converged, weights,
         kept.anchors_of(labels), parts, tuple(notes), time.process_time() - begun,
@@ -108,13 +109,15 @@ def optimize_pose_graph(
 def _as_a_whole(
     problem: PoseGraphProblem, decided: Array | None, config: PoseGraphConfig, progress: Progress | None
 ) -> Plain:
-    """Return the answer that believes all edges, from the poses [N, d + 1, d + 1] that were `decided` if there are."""
+    """Return the answer that believes all edges, from the poses [N, d + 1, d + 1] that were `decided` if they serve."""
     structure = Structure(problem, config.equations)
     if decided is None:
         return solve(structure, config, progress)
-    return Plain(
-        "robust", decided, {"robust": problem.chi2(decided)}, descend(structure, decided, config, progress), ""
-    )
+    descent = descend(structure, decided, config, progress)
+    robust = Plain("robust", decided, {"robust": descent.costs[0]}, descent, "")
+    if descent.converged:
+        return robust
+    return min(solve(structure, config, progress), robust, key=lambda answer: answer.descent.costs[-1])
 
 
 def _by_domains(
@@ -123,8 +126,8 @@ def _by_domains(
     """Return the same, solved by domains. Raises UsageError for what they cannot."""
     if not problem.of_poses:
         raise UsageError("domains are of poses alone, but this graph has landmarks or priors: solve it as a whole")
-    if config.method != "lm" or config.start not in ("auto", "file"):
-        raise UsageError("domains are solved with --method lm and --start auto or file, or else the graph as a whole")
+    if config.start not in ("auto", "file"):
+        raise UsageError("domains are solved with --start auto or file, or else the graph as a whole")
     name, start = ("domains", None) if decided is None else ("robust", decided)
     if config.start == "file":
         name, start = "file", file_start(problem)
@@ -158,14 +161,6 @@ def _decision(structure: Structure, config: PoseGraphConfig, progress: Progress 
     trusted = trusted_edges(structure.problem)
     weights, _ = reject_false_edges(structure, trusted, config.inlier_probability, progress)
     return Decision(None, weights, "graduated non-convexity, as asked for")
-
-
-def _of_landmarks(problem: PoseGraphProblem, poses: Array, weights: Array) -> list[str]:
-    """Return what is to be reported of landmarks."""
-    if not problem.is_point.any():
-        return []
-    free = undetermined_landmarks(problem, poses, weights)
-    return [undetermined_message(free)] if len(free) else []
 
 
 def _of_loops(problem: PoseGraphProblem, poses: Array, weights: Array, probability: float) -> list[str]:

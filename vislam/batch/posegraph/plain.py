@@ -8,7 +8,7 @@ import numpy as np
 
 from vislam.batch.posegraph.growing import grown_start
 from vislam.batch.posegraph.priors import onto_priors
-from vislam.batch.posegraph.solver import Descent, Progress, dogleg, levenberg_marquardt
+from vislam.batch.posegraph.solver import Descent, Progress, levenberg_marquardt
 from vislam.batch.posegraph.starts import angles_start, chordal_start, file_start, odometry_start, tree_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
@@ -32,7 +32,7 @@ class Plain:
 
 
 def solve(structure: Structure, config: PoseGraphConfig, progress: Progress | None = None) -> Plain:
-    """Return the lowest cost that the method finds from the start asked for, or from the cheapest of all.
+    """Return the lowest cost found from the start asked for, or from the cheapest of all.
 
     A start of low cost may lie in a wrong valley. So where the cost that it leads to is more than noise allows, the
     other starts are solved too.
@@ -40,7 +40,7 @@ def solve(structure: Structure, config: PoseGraphConfig, progress: Progress | No
     starts, costs = _starts(structure, config)
     order = sorted(starts, key=costs.__getitem__)
     descents = {order[0]: descend(structure, starts[order[0]], config, progress)}
-    if len(order) > 1 and config.method in ("lm", "dogleg") and _is_doubtful(structure, descents[order[0]].costs[-1]):
+    if len(order) > 1 and _is_doubtful(structure, descents[order[0]].costs[-1]):
         descents |= {name: descend(structure, starts[name], config, progress) for name in order[1:]}
     best = min(descents, key=lambda name: descents[name].costs[-1])
     lowest, note = descents[best].costs[-1], ""
@@ -108,17 +108,8 @@ def _make(name: str, structure: Structure) -> Array:
 
 
 def descend(structure: Structure, start: Array, config: PoseGraphConfig, progress: Progress | None) -> Descent:
-    """Return where the method that was asked for leads from `start` [N, d + 1, d + 1], all edges believed."""
-    problem, weights = structure.problem, np.ones(len(structure.problem.edges))
-    if config.method in ("lm", "dogleg"):
-        native = levenberg_marquardt if config.method == "lm" else dogleg
-        return native(
-            structure, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
-        )  # fmt: skip
-    from vislam.batch.posegraph.gtsam import gtsam_levenberg_marquardt, isam2_replay
-
-    if config.method == "isam2":
-        return isam2_replay(problem, start, weights, progress=progress)
-    return gtsam_levenberg_marquardt(
-        problem, start, weights, iterations=config.iterations, tolerance=config.tolerance, progress=progress
+    """Return where the descent from `start` [N, d + 1, d + 1] leads, all edges believed."""
+    return levenberg_marquardt(
+        structure, start, np.ones(len(structure.problem.edges)), iterations=config.iterations,
+        tolerance=config.tolerance, progress=progress,
     )  # fmt: skip

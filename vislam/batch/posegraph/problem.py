@@ -69,6 +69,8 @@ class PoseGraphProblem:
 
     def with_edges(self, edges: Ids | Mask) -> PoseGraphProblem:
         """Return the problem with some of its edges, by index or by a mask [E]."""
+        if edges.dtype == np.bool_ and edges.all():
+            return self
         return replace(
             self, edges=self.edges[edges], measurements=self.measurements[edges], information=self.information[edges],
             is_position=self.is_position[edges],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -38,12 +37,13 @@ def odometry_start(problem: PoseGraphProblem, anchors: Ints) -> Array:
     successive = (np.abs(rank[problem.edges[:, 1]] - rank[problem.edges[:, 0]]) == 1) & problem.is_pose[
         problem.edges
     ].all(axis=1)
-    return _chained(problem, _mask(problem, anchors), successive)
+    return _chained(problem, np.isin(np.arange(len(problem.ids)), anchors), successive)
 
 
 def tree_start(problem: PoseGraphProblem, anchors: Ints) -> Array:
     """Return poses chained from the anchors by as few edges as possible."""
-    return _chained(problem, _mask(problem, anchors), np.zeros(len(problem.edges), dtype=np.bool_))
+    known = np.isin(np.arange(len(problem.ids)), anchors)
+    return _chained(problem, known, np.zeros(len(problem.edges), dtype=np.bool_))
 
 
 def chordal_start(structure: Structure, weights: Array) -> Array:
@@ -59,9 +59,9 @@ def chordal_start(structure: Structure, weights: Array) -> Array:
     R, Z = poses[:, :d, :d], problem.measurements[:, :d, :d]
     if d == 3:
         relaxed = _relax(structure, rotation_weight, Z.transpose(0, 2, 1), R.transpose(0, 2, 1))
-        rotations = np.empty((len(structure.free), 3, 3))
-        _nearest_rotations(relaxed, rotations)
-        poses[structure.free, :3, :3] = rotations
+        U, _, Vt = np.linalg.svd(relaxed.transpose(0, 2, 1))
+        U[:, :, 2] *= np.copysign(1.0, np.linalg.det(U) * np.linalg.det(Vt))[:, None]
+        poses[structure.free, :3, :3] = U @ Vt
     else:
         heading = _relax(structure, rotation_weight, Z, R[:, :, :1])[:, :, 0]
         length = np.linalg.norm(heading, axis=1)
@@ -145,7 +145,7 @@ def _carried(structure: Structure, motions: Array) -> Array:
     back = np.tile(np.eye(d + 1), (int(inside.sum()), 1, 1))  # products grow on the left: of the transposed ones
     back[:, :d, :d] = motions[inside].transpose(0, 2, 1)
     poses = np.tile(np.eye(d + 1), (len(cluster), 1, 1))
-    reached = _mask(problem, structure.free[clusters.first])
+    reached = np.isin(np.arange(len(cluster)), structure.free[clusters.first])
     _chain(problem.edges[inside], back, np.zeros(len(back), dtype=np.bool_), reached, poses)
     return np.ascontiguousarray(poses[structure.free, :d, :d].transpose(0, 2, 1))
 
@@ -170,36 +170,21 @@ def _solve(
 
 
 def _isotropic(problem: PoseGraphProblem, weights: Array) -> tuple[Array, Array]:
-    """Return isotropic weights [E] of rotations and translations: inverses of the mean variances."""
-    turn = 1 if problem.dimension == 2 else 3
+    """Return isotropic weights [E] of rotations and translations, at least a millionth of the mean eigenvalue."""
+    turn = problem.tangent - problem.dimension
     rotation, translation = problem.information[:, :turn, :turn], problem.information[:, turn:, turn:]
-    return weights * _harmonic(rotation), weights * _harmonic(translation)
+    return tuple(
+        weights * np.maximum(harmonic_means(W), 1e-6 * np.einsum("eii->e", W) / W.shape[1])
+        for W in (rotation, translation)
+    )
 
 
-def _harmonic(information: Array) -> Array:
-    """Return k / trace(W^-1) of matrices [E, k, k], at least a millionth of their mean eigenvalue."""
-    k = information.shape[1]
-    mean = np.einsum("eii->e", information) / k
-    W = information
-    if k == 1:
-        return W[:, 0, 0]
-    if k == 2:
-        minors, determinant = W[:, 0, 0] + W[:, 1, 1], W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] ** 2
-    else:
-        a = W[:, 1, 1] * W[:, 2, 2] - W[:, 1, 2] ** 2
-        b = W[:, 0, 1] * W[:, 2, 2] - W[:, 0, 2] * W[:, 1, 2]
-        c = W[:, 0, 1] * W[:, 1, 2] - W[:, 0, 2] * W[:, 1, 1]
-        minors = a + W[:, 0, 0] * W[:, 2, 2] - W[:, 0, 2] ** 2 + W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] ** 2
-        determinant = W[:, 0, 0] * a - W[:, 0, 1] * b + W[:, 0, 2] * c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        harmonic = np.where(minors > 0.0, k * determinant / minors, 0.0)
-    return np.maximum(harmonic, 1e-6 * mean)
-
-
-def _mask(problem: PoseGraphProblem, chosen: Ints) -> Mask:
-    out = np.zeros(len(problem.ids), dtype=np.bool_)
-    out[chosen] = True
-    return out
+def harmonic_means(W: Array) -> Array:
+    """Return the harmonic means [E] of the eigenvalues of matrices [E, m, m], 0 where one of them is."""
+    eigenvalues = np.linalg.eigvalsh(W)
+    singular = eigenvalues[:, 0] <= 1e-12 * eigenvalues[:, -1]
+    eigenvalues[singular] = 1.0
+    return np.where(singular, 0.0, W.shape[1] / np.sum(1.0 / eigenvalues, axis=1))
 
 
 def _placed_anchors(problem: PoseGraphProblem) -> Array:
@@ -286,45 +271,3 @@ def _compose(poses: Array, i: int, j: int, Z: Array, forward: bool, size: int) -
         for k in range(d):
             s += T[a, k] * Z[k, d] if forward else -G[a, k] * Z[k, d]
         G[a, d] = s
-
-
-def _nearest_rotations(relaxed: Array, out: Array) -> None:
-    """Write the rotation nearest to each relaxed matrix, transposed: Newton's polar iteration, else by the SVD."""
-    _by_newton(relaxed, out)
-    for n in np.flatnonzero(np.isnan(out[:, 0, 0])):
-        U, _, Vt = np.linalg.svd(relaxed[n].T)
-        U[:, 2] *= np.copysign(1.0, np.linalg.det(U) * np.linalg.det(Vt))
-        out[n] = U @ Vt
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _by_newton(relaxed: Array, out: Array) -> None:
-    """Write the rotation nearest to each relaxed matrix, transposed, by Newton's polar iteration; NaN if it fails."""
-    X, C = np.empty((3, 3)), np.empty((3, 3))
-    for n in range(len(relaxed)):
-        for a in range(3):
-            for b in range(3):
-                X[a, b] = relaxed[n, b, a]
-        good = True
-        for _ in range(30):
-            for a in range(3):
-                p, q = (a + 1) % 3, (a + 2) % 3
-                for b in range(3):
-                    u, v = (b + 1) % 3, (b + 2) % 3
-                    C[a, b] = X[p, u] * X[q, v] - X[p, v] * X[q, u]
-            determinant = X[0, 0] * C[0, 0] + X[0, 1] * C[0, 1] + X[0, 2] * C[0, 2]
-            if not determinant > 1e-9:
-                good = False
-                break
-            scale = determinant ** (-1.0 / 3.0)
-            change = 0.0
-            for a in range(3):
-                for b in range(3):
-                    value = 0.5 * (scale * X[a, b] + C[a, b] / (determinant * scale))
-                    change = max(change, abs(value - X[a, b]))
-                    X[a, b] = value
-            if change < 1e-9:
-                break
-        for a in range(3):
-            for b in range(3):
-                out[n, a, b] = X[a, b] if good else math.nan

@@ -136,10 +136,6 @@ class NormalEquations:
         out[:, np.arange(k), np.arange(k)] = entries + damping * np.maximum(entries, floor)
         return out
 
-    def curvature(self, step: Array) -> float:
-        """Return step^T H step of a step [n, k]."""
-        return float(np.vdot(step, self.product(step)))
-
     def product(self, step: Array) -> Array:
         """Return H @ step [n, k]."""
         s, out = self._structure, np.empty_like(step)

@@ -112,7 +112,11 @@ def _postordered(begins: Ints, neighbours: Ints, order: Ints) -> tuple[Ints, Int
                     parent[i] = k
                 i = following
     child, sibling = np.full(n, _NONE, dtype=np.int64), np.full(n, _NONE, dtype=np.int64)
-    for k in range(n - 1, -1, -1):
+    size = np.ones(n, dtype=np.int64)
+    for k in range(n):
+        if parent[k] != _NONE:
+            size[parent[k]] += size[k]
+    for k in np.argsort(size, kind="mergesort"):
         if parent[k] != _NONE:
             sibling[k] = child[parent[k]]
             child[parent[k]] = k

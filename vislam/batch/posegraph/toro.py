@@ -7,6 +7,7 @@ there is of the world's frame, so it is no function of relative motion.
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from vislam.batch.posegraph.parts import EdgeLines, PoseLines, problem_from_line
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.tagged_lines import read_tagged_lines
 from vislam.core.errors import DataError
-from vislam.core.files import write_text
+from vislam.core.files import write_lines
 from vislam.core.messages import Array
 
 _COLUMNS = BEARING_RANGE_COLUMNS | {
@@ -82,5 +83,4 @@ def write_toro(problem: PoseGraphProblem, path: Path, poses: Array | None = None
     else:
         back = np.argsort(_ORDER_3D)
         upper, tags = problem.information[:, back[a], back[b]], ("VERTEX3", "EDGE3")
-    lines = [*pose_lines(problem, poses, tags[0]), *edge_lines(problem, upper, tags[1])]
-    write_text(path, "\n".join(lines) + "\n")
+    write_lines(path, chain(pose_lines(problem, poses, tags[0]), edge_lines(problem, upper, tags[1])))

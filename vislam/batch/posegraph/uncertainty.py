@@ -32,27 +32,25 @@ class Uncertainty:
         self._problem = problem if weights is None else problem.with_edges(weights != 0.0)
         self._poses = np.ascontiguousarray(poses, dtype=np.float64)
         self._structure = Structure(self._problem)
-        self._factor = self._structure.factor(problem.tangent)
-        equations = NormalEquations(self._structure, self._factor)
+        self.factor = self._structure.factor(problem.tangent)
+        equations = NormalEquations(self._structure, self.factor)
         equations.linearise(self._poses, np.ones(len(self._problem.edges)))
         if not equations.factorise(0.0):
             free = undetermined_landmarks(self._problem, self._poses, np.ones(len(self._problem.edges)))
             if len(free):
                 raise DataError(f"{undetermined_message(free)}; so there is no covariance")
-            raise DataError(
-                "the measurements leave a pose undetermined, so there is no covariance; give its edges more"
-            )
+            raise DataError("measurements leave a pose undetermined, so there is no covariance; give its edges more")
 
     def of(self, ids: Ids) -> Array:
         """Return the covariances [M, k, k] of poses, zero for anchors. Raises UsageError for an unknown id."""
         at, k = self._places(ids), self._problem.tangent
         ends = np.column_stack([self._structure.index[at], np.full(len(at), -1)])
-        return self._factor.edge_covariances(ends, np.tile(np.eye(k), (len(at), 2, 1, 1)))
+        return self.factor.edge_covariances(ends, np.tile(np.eye(k), (len(at), 2, 1, 1)))
 
     def of_all(self) -> Array:
         """Return the covariances [N, k, k] of all poses, zero for anchors."""
         out = np.zeros((len(self._poses), self._problem.tangent, self._problem.tangent))
-        inverse = inverse_diagonal(self._factor)
+        inverse = inverse_diagonal(self.factor)
         out[self._structure.free] = 0.5 * (inverse + inverse.transpose(0, 2, 1))
         return out
 
@@ -69,7 +67,7 @@ class Uncertainty:
         between = invert_many(self._poses[at[:, 1]]) @ self._poses[at[:, 0]]
         turned = np.tile(np.eye(self._problem.tangent), (len(at), 2, 1, 1))
         turned[:, 0] = -adjoints(between)
-        return self._factor.edge_covariances(self._structure.index[at], turned)
+        return self.factor.edge_covariances(self._structure.index[at], turned)
 
     def _places(self, ids: Ids) -> Ids:
         ids = np.asarray(ids, dtype=np.int64)
@@ -77,6 +75,14 @@ class Uncertainty:
         if len(missing := np.flatnonzero(self._problem.ids[at] != ids)):
             raise UsageError(f"there is no pose {ids[missing[0]]} in the graph")
         return at
+
+
+def uncertainty_if_any(problem: PoseGraphProblem, poses: Array, weights: Array) -> Uncertainty | None:
+    """Return the uncertainty of a solution; None where a pose is undetermined, or the factor too large."""
+    try:
+        return Uncertainty(problem, poses, weights)
+    except (DataError, UsageError):
+        return None
 
 
 def ellipses(

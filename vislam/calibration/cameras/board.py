@@ -1,7 +1,5 @@
 """Calibration boards: drawn to be printed, and found in images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, BinaryIO, Literal

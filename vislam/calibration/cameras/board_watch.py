@@ -1,7 +1,5 @@
 """Views of a board, kept while it is moved before a live camera: which parts of the image and which slants lack."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The floor's flow shows the tilt, whatever the height: points that pass near and 
 height is pure scale: only a measured way, or a tape, gives it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

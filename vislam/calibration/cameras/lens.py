@@ -6,8 +6,6 @@ Gauss-Newton on `vislam.core.camera.Camera`, the poses eliminated; sigmas come f
 leaving out one view at a time (a jackknife of one step) where that is larger.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 

@@ -5,8 +5,6 @@ unit of depth is no part of it: images and depth alone look the same in a world 
 its own has its place, focal length and lag found first, then the focal length of colour.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

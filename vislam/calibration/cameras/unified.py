@@ -5,8 +5,6 @@ only the focal length is to be tried (Mei and Rives, ICRA 2007, begin at xi = 1,
 homographies in views turned towards the board, so that a board beside or behind the camera is as good as one before it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

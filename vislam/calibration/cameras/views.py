@@ -1,7 +1,5 @@
 """Images that show a calibration board, from a folder, a video, a recording or a live camera."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`vislam calibrate camera-imu`: how the camera is turned against the IMU, and how far their clocks are apart."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What a finished run found of its further sensors, as a file for the next one: every run is a calibration of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Rotations of a camera from its images alone: no gyroscope, no scale, no extrinsics."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

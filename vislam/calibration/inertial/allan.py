@@ -5,8 +5,6 @@ walk of density K is `N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3`. Degrees of f
 1065, section 5.4).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

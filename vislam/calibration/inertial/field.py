@@ -5,8 +5,6 @@ all, the ellipse is. Points `m` obey `|A (m - c)| = r`; A is symmetric (a rotati
 it is) with determinant one, so that the field keeps its strength.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

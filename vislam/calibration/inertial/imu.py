@@ -1,7 +1,5 @@
 """`vislam calibrate imu`: scale, axes and bias of accelerometer and gyroscope, from a dozen poses held by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """`vislam calibrate mag`: hard and soft iron, from one slow turn on the cart or from turns by hand to all sides."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal

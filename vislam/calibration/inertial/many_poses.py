@@ -6,8 +6,6 @@ the gyroscope must turn one direction of gravity into the other. The length alon
 it is fixed by an upper triangular matrix: the calibrated z axis is the chip's own, y lies in the plane of its y and z.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """`vislam calibrate noise`: white noise and bias walk of an IMU that stood still, and what driving adds to them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any

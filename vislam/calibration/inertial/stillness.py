@@ -5,8 +5,6 @@ quiet as well, which separates a slow turn about the vertical from rest. `imu/re
 also of the mean rate, which do not hold before calibration; and a pause is cut out to the sample here.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How well a lens is known: what residuals say, or what the stretches say against each other where that is more."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Depth and pixels of rigid points show the focal length another way than tracks d
 as one measurement, against which the images weigh as much as their widened sigmas allow.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

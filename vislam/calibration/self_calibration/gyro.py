@@ -4,8 +4,6 @@ The rotation part of Kalibr (Furgale et al., IROS 2013), by `imu/gyro_turns.py`,
 far as its calibration leaves it: an exact one would give the focal length better than most cameras can.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

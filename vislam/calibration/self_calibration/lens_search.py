@@ -1,7 +1,5 @@
 """From tracks to a lens: which focal length fits at all, then the whole lens with the readout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

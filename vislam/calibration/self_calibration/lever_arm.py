@@ -9,8 +9,6 @@ where the body is at P = s centre - R lever, and dp, dv are preintegrated. Each 
 known length; the lever arm and the accelerometer's bias are shared.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ focal length most. Once structure and lens are known roughly, every view can be 
 (Klein and Murray, ISMAR 2007; inverse compositional, Baker and Matthews, IJCV 2004).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A first structure of a stretch for a lens that is roughly right: two views, then one after the other."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """`vislam calibrate self`: a camera's lens from waving it about before anything with texture."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

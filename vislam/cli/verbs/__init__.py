@@ -4,8 +4,6 @@
 What takes long to import is imported after the arguments are understood, so that --help and complaints come at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -61,6 +59,10 @@ _VERBS = {
     "live": Verb(
         "run the pipeline on live sensors and publish the pose; --resume RUN goes on with a run",
         "vislam live --source virtual-cart --out runs/cart",
+    ),
+    "drive": Verb(
+        "drive the virtual cart to goals, on the published pose and the map as it grows",
+        "vislam drive --goal 2 0 90 --goal 0.5 0.2 180 --out runs/hall",
     ),
     "report": Verb("write report.html of a run again", "vislam report runs/desk"),
     "export": Verb(

@@ -1,7 +1,5 @@
 """How verbs understand their arguments: tyro on a dataclass of options, whose comments are the --help."""
 
-from __future__ import annotations
-
 import re
 import sys
 from contextlib import redirect_stderr

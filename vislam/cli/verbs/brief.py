@@ -1,7 +1,5 @@
 """The short --help of verbs with hundreds of settings: examples, the verb's own options, what people change."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import shutil
@@ -60,8 +58,9 @@ def brief_help(verb: str, options: type, brief: Brief) -> str:
 
 def said_of(setting: Setting) -> str:
     """Return what the source says of a setting: behind it, in the lines above it, or in the string below it."""
-    source = inspect.getsource(setting.owner)
     name = re.escape(setting.path[-1])
+    owner = next(cls for cls in setting.owner.__mro__ if setting.path[-1] in vars(cls).get("__annotations__", {}))
+    source = inspect.getsource(owner)
     behind = re.search(rf"^    {name}: [^\n]*?  # (.+)$", source, re.MULTILINE)
     below = re.search(rf'^    {name}: [^\n]*\n    """(.+?)"""', source, re.MULTILINE | re.DOTALL)
     above = re.search(rf"((?:^    # [^\n]+\n)+)    {name}: ", source, re.MULTILINE)

@@ -1,7 +1,5 @@
 """`vislam calibrate WHAT`: what camera, IMU, magnetometer and floor are like; `calibration.kinds` has every WHAT."""
 
-from __future__ import annotations
-
 import json
 
 from vislam.calibration.kinds import KINDS

@@ -1,7 +1,5 @@
 """`vislam compare`: estimators against each other, as a plan says."""
 
-from __future__ import annotations
-
 import json
 
 from vislam.cli.verbs.arguments import parse

@@ -1,7 +1,5 @@
 """`vislam completion SHELL`: what makes the shell complete verbs, options and their words."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Literal

@@ -1,7 +1,5 @@
 """`vislam demo`: everything at once, without a recording."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from pathlib import Path

@@ -87,7 +87,7 @@ def main(arguments: list[str]) -> int:
 def _evaluate(options: EvalOptions) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Return the errors of each trajectory by its name, and what estimate and reference were taken for."""
     from vislam.runs.offline.evaluated import is_run, read_evaluated
-    from vislam.trajectory import evaluate, spans
+    from vislam.trajectory import are_misordered, evaluate, spans
 
     path, span_ns, align = options.estimate, None, options.align or "se3"
     truth: Trajectory | None = None
@@ -105,10 +105,17 @@ def _evaluate(options: EvalOptions) -> tuple[dict[str, dict[str, Any]], dict[str
         estimates, timed = {path.name: found.trajectory}, found.timed
         taken_for["estimate"] = f"{path.name}: {found.taken_for}"
     if options.reference is not None:
-        found = _reference(options)
+        found = _read(options.reference, options.reference_topic, options.reference_times, options.times)
         truth = found.trajectory
         taken_for["reference"] = f"{options.reference.name}: {found.taken_for}"
         _check_times(timed, found.timed, max(map(len, estimates.values())), len(truth))
+        how = (options.association, options.max_gap_s)
+        if any(are_misordered(estimate, truth, *how) for estimate in estimates.values()):
+            raise DataError(
+                f"the rotations of {path.name} and {options.reference.name} fit only if one of both has its "
+                "quaternion's w at the other end; name the columns of that one in its first line: "
+                "# t tx ty tz qw qx qy qz"
+            )
     elif truth is None:
         raise UsageError(f"{path} brings no truth to be evaluated against; give --reference FILE")
     settings: dict[str, Any] = {"max_gap_s": options.max_gap_s, "max_hole_s": options.max_hole_s}
@@ -119,16 +126,8 @@ def _evaluate(options: EvalOptions) -> tuple[dict[str, dict[str, Any]], dict[str
     }, taken_for
 
 
-def _reference(options: EvalOptions) -> Recognised:
-    """Return the reference; one without times may take those of the estimate."""
-    assert options.reference is not None
-    times = options.reference_times
-    found = _read(options.reference, options.reference_topic, times)
-    return found if found.timed or not options.times else _read(options.reference, "", options.times)
-
-
-def _read(path: Path, topic: str, times: Path | None) -> Recognised:
-    """Return the trajectory in a file, or on a topic of a bag."""
+def _read(path: Path, topic: str, times: Path | None, or_times: Path | None = None) -> Recognised:
+    """Return the trajectory in a file, or on a topic of a bag; times are as `recognise` takes them."""
     from vislam.datasets.bags import is_bag, trajectory_of_topic
     from vislam.trajectory import Recognised, recognise
 
@@ -138,7 +137,7 @@ def _read(path: Path, topic: str, times: Path | None) -> Recognised:
         return Recognised(*trajectory_of_topic(path, topic))
     if topic:
         raise UsageError(f"{path} is no bag, and has no topic {topic}; leave it out")
-    return recognise(path, times)
+    return recognise(path, times, or_times)
 
 
 def _check_times(estimate_timed: bool, reference_timed: bool, poses: int, true_poses: int) -> None:

@@ -1,7 +1,5 @@
 """`vislam export`: the results of a run for other programs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -78,9 +78,9 @@ BRIEF = Brief(
         "vislam live --source gy85+webcam --calibration.camera camera.yaml --out runs/cart --web",
     ),
     (
-        *COMMON, "live.send_to", "live.allow_remote", "live.ros2_domain", "live.mavlink", "live.realtime_priority",
-        "loop.start_in_map", "power_up.memory", "sensors.gy85.bus", "sensors.board.bus", "sensors.serial.port",
-        "sensors.webcam.device",
+        *COMMON, "live.send_to", "live.group", "live.allow_remote", "live.ros2_domain", "live.mavlink",
+        "live.realtime_priority", "loop.start_in_map", "power_up.memory", "sensors.gy85.bus", "sensors.board.bus",
+        "sensors.serial.port", "sensors.webcam.device",
     ),
     TAKEN,
 )  # fmt: skip
@@ -172,7 +172,7 @@ def _execute(
             metrics = live.execute(follow, seconds)
         except KeyboardInterrupt:
             if live.is_brief:  # there was no time for more than the session
-                print(f"vislam: to go on from there: vislam optimize {out}, or live --resume {out}", file=sys.stderr)
+                print(f"vislam: {_what_now(out)}", file=sys.stderr)
             raise
     if station is not None and not live.is_brief:
         station.end(metrics)
@@ -180,3 +180,13 @@ def _execute(
     if live.is_brief and not as_json:
         print(f"left out, for Ctrl-C does not wait: vislam map {out}; vislam report {out}", flush=True)
     return 0
+
+
+def _what_now(out: Path) -> str:
+    """Return what can be done with a run that was interrupted before it was written up."""
+    from vislam.runs.session import can_go_on, has_frames
+
+    if not has_frames(out / "session.db"):
+        return "nothing was recorded yet; the same command begins again"
+    optimise = f", or vislam optimize {out}" if can_go_on(out / "session.db") else ""
+    return f"to go on from there: vislam live --resume {out}{optimise}"

@@ -1,7 +1,5 @@
 """`vislam loops`: the loop edges of a run, and the run without some of them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

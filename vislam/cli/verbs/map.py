@@ -1,7 +1,5 @@
 """`vislam map`: the maps of a run made again, or questions to an OctoMap file."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

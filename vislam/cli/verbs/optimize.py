@@ -1,7 +1,5 @@
 """`vislam optimize`: the best estimate of a run, or of several runs joined."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`vislam posegraph`: the best estimate of a pose graph from a file."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,7 +61,7 @@ def _optimize(options: PoseGraphOptions, out: Path) -> int:
     if options.report:
         write_graph_report(
             result.problem, result.solution, options.file.stem, out / "report.html", result.certificate,
-            as_stated(result.problem, result.solution.weights),
+            as_stated(result.problem, result.solution.weights), result.uncertainty,
         )  # fmt: skip
     summary = result.summary
     if options.json:

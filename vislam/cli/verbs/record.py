@@ -1,7 +1,5 @@
 """`vislam record`: the cart's IMU and camera into a recording."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -61,11 +59,10 @@ def main(arguments: list[str]) -> int:
     """Record until the time is over or a signal comes."""
     sensors, further = load_cart(take_path(arguments, "--config"))
     options = parse(RecordOptions, arguments, "record", RecordOptions(out=tyro.MISSING, sensors=sensors), BRIEF)
-    from vislam.live.port_readings import PortReadings
     from vislam.runs.record import record
     from vislam.runs.recorded_readings import further_ports
 
-    ports = None if further.file is None else further_ports(Path(further.file), PortReadings)
+    ports = None if further.file is None else further_ports(Path(further.file))
     with rewritten_line() as show:
         recorded = record(
             options.out, options.imu, options.camera, options.sensors, options.settings, options.seconds,

@@ -1,7 +1,5 @@
 """`vislam report`: report.html of a run again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The metrics of a run on the terminal."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`vislam run`: the pipeline over a recording, from its start or from where a run of it ended."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,6 +97,8 @@ def _resume(out: Path, arguments: list[str], command: list[str]) -> int:
     if (out / "sensors.json").is_file():
         raise UsageError(f"{out} is a live run; go on with it by vislam live --resume {out}")
     source, config, base = read_setup(out)
+    if source.partition(",")[0] == "virtual-cart":
+        raise UsageError(f"{out} was driven, and cannot be taken up again; begin in its map: vislam drive --map {out}")
     recording = open_source(source, config.seed, config.calibration)
     with written_up(out, command), progress_bar(recording.name) as progress:
         metrics = resume(recording, config, out, source, command, progress, base)

@@ -1,7 +1,5 @@
 """`vislam simulate`: a recording of a simulated world, or a pose graph, with exact truth."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +10,7 @@ from tyro.conf import Positional
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import GraphWorldConfig
-from vislam.config.ranges import Count, Few, NonNegative, Positive, Seed
+from vislam.config.ranges import Count, Few, NonNegative, Positive, Seed, Whole
 
 
 @dataclass(frozen=True)
@@ -25,6 +23,8 @@ class SimulateOptions:
     """Folder to make for the recording (ASL layout, with truth)"""
     rig: Literal["rgbd", "stereo", "mono"] | None = None
     """Cameras; None: what the world has"""
+    further_cameras: Whole = 0
+    """Beside those, evenly around the vertical, at most 6"""
     duration_s: Positive | None = None
     """Only the first so many seconds"""
     camera_hz: Positive | None = None

@@ -1,7 +1,5 @@
 """What verbs share on the terminal: a progress bar, a status line, tables of numbers."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import time

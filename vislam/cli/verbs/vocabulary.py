@@ -1,7 +1,5 @@
 """`vislam vocabulary`: the words of loop closing, trained or converted."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated

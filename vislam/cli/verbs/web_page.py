@@ -77,7 +77,7 @@ def begun_by_page(
 
     Raises VislamError: the process of the page died.
     """
-    from vislam.cli.wizard.calibration_steps import STEPS, CalibrationSteps
+    from vislam.cli.wizard.calibration_steps import CalibrationSteps
     from vislam.cli.wizard.run_setup import RunSetup
 
     steps = CalibrationSteps(station, RunSetup(options.source, options.settings, options.sensors), options.out)
@@ -93,6 +93,6 @@ def begun_by_page(
                 else:
                     steps.obey(asked.do, asked.values)
             can = ["start"] if not steps.is_going else []
-            station.update("waiting", source=options.source, can=can, steps=STEPS, wizard=steps.shown)
+            station.update("waiting", source=options.source, can=can, steps=steps.offered, wizard=steps.shown)
             steps.turn()
     raise VislamError("the process of the web page died before the run began; start it again")

@@ -1,7 +1,5 @@
 """Calibration steps as the page asks for them: begun, shown while they go, finished or left."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Mapping
@@ -13,7 +11,7 @@ from vislam.calibration.kinds import KINDS
 from vislam.calibration.options import BoardOptions
 from vislam.calibration.watching import Progress, Watch
 from vislam.cli.wizard.run_setup import RunSetup
-from vislam.cli.wizard.step_sensors import StepSensors, opened
+from vislam.cli.wizard.step_sensors import CartSensors, PlayedSensors, opened, why_not
 from vislam.config import validated
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.files import plain
@@ -40,12 +38,19 @@ class CalibrationSteps:
 
         Attributes:
             setup: the same with what was calibrated since.
+            offered: what each step that these sensors allow does, by kind.
         """
         self._station, self.setup = station, setup
         self._folder = out / FOLDER
+        watches = {name: KINDS[name].watch for name in STEPS}
+        self.offered = {
+            name: STEPS[name]
+            for name, watch in watches.items()
+            if watch and not why_not(setup.source, watch.has_images)
+        }
         self._kind = ""
         self._watch: Watch | None = None
-        self._opened: StepSensors | None = None
+        self._opened: CartSensors | PlayedSensors | None = None
         self._told_s = 0.0
         self.shown: dict[str, Any] = {}  # of the step, for the page
 

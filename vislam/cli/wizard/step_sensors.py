@@ -1,12 +1,9 @@
 """The sensors of a calibration step: those that the run will have, raw, or a recording in real time."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from typing import Protocol
 
 import cv2
 
@@ -26,47 +23,28 @@ _NO_FRAMES_NS = 1 << 62
 _NS = 1e-9
 
 
-class StepSensors(Protocol):
-    """What a step reads."""
-
-    def read(self, timeout_s: float) -> list[Value]:
-        """Return what has come since, waiting at most so long for the first of it."""
-        ...
-
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing more will come."""
-        ...
-
-    def close(self) -> None:
-        """Give the devices back; may be called twice."""
-        ...
+def why_not(source: str, has_images: bool) -> str:
+    """Return why a live run's source has no camera, or no IMU, that a person could move; empty where it may have."""
+    _, plus, camera = source.partition("+")
+    if source.startswith("replay:") or _is_camera_alone(source):
+        return ""
+    if not plus:
+        return f"{source} has nothing that a hand could move; calibrate with a cart's sensors or a replay"
+    return f"{source} has no camera to calibrate" if has_images and camera == "none" else ""
 
 
-def opened(setup: RunSetup, has_images: bool) -> StepSensors:
-    """Return the cameras, or the IMU, of a live run's source.
-
-    Raises UsageError where it has none that a person could move, HardwareError where one is missing.
-    """
-    source = setup.source
-    if source.startswith("replay:"):
-        return _Played(source.removeprefix("replay:"), setup.config, has_images)
-    inertial, plus, camera = source.partition("+")
-    if not plus and inertial.partition(",")[0].partition(":")[0] in WITH_IMU:
-        inertial, camera = "", source
-    elif plus and reads_own_imu(inertial, camera):
-        inertial = ""
-    elif not plus:
-        raise UsageError(f"{source} has nothing that a hand could move; calibrate with a cart's sensors or a replay")
-    if has_images and camera == "none":
-        raise UsageError(f"{source} has no camera to calibrate")
-    return _Cart(inertial, camera, setup.sensors, has_images)
+def _is_camera_alone(source: str) -> bool:
+    """Return whether a source is a camera with the IMU inside it."""
+    return "+" not in source and source.partition(",")[0].partition(":")[0] in WITH_IMU
 
 
-class _Cart:
+class CartSensors:
     """Devices of this machine."""
 
+    is_over = False
+
     def __init__(self, inertial: str, camera: str, sensors: SensorsConfig, has_images: bool) -> None:
+        """Open the IMU, or the camera if images are asked for; raises HardwareError."""
         self._devices = ExitStack()
         self._images: ImageSource | LibraryCamera[Frame] | None = None
         self._inertial: InertialSource | None = None
@@ -81,10 +59,9 @@ class _Cart:
             self._devices.enter_context(closing(self._images))
         else:
             self._inertial = self._devices.enter_context(closing(open_inertial(inertial, raw)))
-        self.is_over = False
 
     def read(self, timeout_s: float) -> list[Value]:
-        """Return samples, or the newest image."""
+        """Return samples, or the newest image, waiting at most so long for the first."""
         if self._inertial is not None:
             return list(self._inertial.read(timeout_s))
         assert self._images is not None
@@ -92,14 +69,15 @@ class _Cart:
         return [] if captured is None else [_frame(captured)]
 
     def close(self) -> None:
-        """Give the devices back."""
+        """Give the devices back; may be called twice."""
         self._devices.close()
 
 
-class _Played:
+class PlayedSensors:
     """A recording in real time; frames that nobody took in time are left out."""
 
     def __init__(self, uri: str, config: Config, has_images: bool) -> None:
+        """Begin to play; raises HardwareError where there is nothing to play."""
         recording = open_source(uri, config.seed, config.calibration)
         if has_images:
             with_camera(recording)
@@ -116,7 +94,7 @@ class _Played:
         return self._next is None
 
     def read(self, timeout_s: float) -> list[Value]:
-        """Return the values whose time has come; of frames the newest."""
+        """Return the values whose time has come, waiting at most so long for the first; of frames the newest."""
         out: deque[Value] = deque(maxlen=1 if self._has_images else None)
         deadline_s = time.monotonic() + timeout_s
         while self._next is not None:
@@ -135,6 +113,24 @@ class _Played:
     def close(self) -> None:
         """Stop reading."""
         self._next = None
+
+
+def opened(setup: RunSetup, has_images: bool) -> CartSensors | PlayedSensors:
+    """Return the cameras, or the IMU, of a live run's source.
+
+    Raises UsageError where it has none that a person could move, HardwareError where one is missing.
+    """
+    source = setup.source
+    if refusal := why_not(source, has_images):
+        raise UsageError(refusal)
+    if source.startswith("replay:"):
+        return PlayedSensors(source.removeprefix("replay:"), setup.config, has_images)
+    inertial, plus, camera = source.partition("+")
+    if _is_camera_alone(source):
+        inertial, camera = "", source
+    elif plus and reads_own_imu(inertial, camera):
+        inertial = ""
+    return CartSensors(inertial, camera, setup.sensors, has_images)
 
 
 def _frame(captured: CapturedImage | Frame) -> Frame:

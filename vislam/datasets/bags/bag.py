@@ -7,12 +7,13 @@ import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
+from vislam.core.encoded_image import most_pixels
 from vislam.core.errors import DataError
-from vislam.core.reading import open_file
+from vislam.core.reading import Budget, open_file
 from vislam.core.recording import Problems
 from vislam.datasets.bags import mcap, rosbag1, sqlite
 from vislam.datasets.bags.chunks import unpacked_message
-from vislam.datasets.bags.stored import HEAD_BYTES, Container, DamagedError, Found, Place
+from vislam.datasets.bags.stored import HEAD_BYTES, MOST_MESSAGE_BYTES, Container, DamagedError, Found, Place
 from vislam.datasets.calibration import load_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -21,6 +22,8 @@ _STORED = (".mcap", ".db3")
 _PACKED = (".mcap.zstd", ".db3.zstd")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _MOST_FILES = 10_000
+_PIXEL_BYTES, _AROUND_BYTES = 8, 2**16  # of an image message
+_FREE_BYTES, _TIMES = 2**25, 100  # of another that was packed by itself, of which a first image may be one
 
 
 class Bag:
@@ -39,6 +42,7 @@ class Bag:
         try:
             for number, file in enumerate(self.files):
                 self._containers.append(_container(file, number))
+            self._budget = Budget(path, self.size_bytes)  # of messages that are packed one by one
         except OSError as error:
             raise DataError(f"{error.filename or path} cannot be read: {error.strerror or error}") from error
 
@@ -65,15 +69,25 @@ class Bag:
         if refused and len(refused) == len(self._containers):
             raise refused[0]
 
-    def read(self, place: Place) -> bytes:
-        """Return the bytes of a message; raises DamagedError, and OSError when the disk fails."""
+    def read(self, place: Place, size_px: tuple[int, int] | None = None) -> bytes:
+        """Return the bytes of a message, which may be an image of `size_px`.
+
+        Raises DamagedError, OSError when the disk fails, and DataError once packed ones ask for far too much.
+        """
         data = self._containers[place.file].read(place)
-        return unpacked_message(data) if _is_packed(data) else data
+        if not _is_packed(data):
+            return data
+        if size_px is not None:
+            pixels = min(size_px[0] * size_px[1], most_pixels(len(data)))
+            return unpacked_message(data, _PIXEL_BYTES * pixels + _AROUND_BYTES)
+        out = unpacked_message(data, min(MOST_MESSAGE_BYTES, _FREE_BYTES + _TIMES * len(data)))
+        self._budget.take(0, len(out))
+        return out
 
     def _with_unpacked_head(self, found: Found) -> Found:
         try:
             packed = self._containers[found.place.file].read(found.place)
-            return found._replace(head=unpacked_message(packed, HEAD_BYTES))
+            return found._replace(head=unpacked_message(packed, HEAD_BYTES, HEAD_BYTES))
         except (DamagedError, OSError):
             return found._replace(head=b"")  # counted where it is decoded
 

@@ -5,27 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, Literal
 
+from vislam.core.camera import MOST_CAMERAS
 from vislam.core.errors import DataError
 from vislam.datasets.bags.decoding import (
     CAMERA_INFO,
-    COMPRESSED,
     IMAGE,
+    IMAGES,
     IMU,
     MAGNETIC,
-    ODOMETRY,
-    POSE,
-    POSE_COVARIANCE,
-    TRANSFORM,
+    POSES,
     why_unreadable,
 )
+from vislam.datasets.bags.films import codec_of, film_size, why_no_video
 from vislam.datasets.bags.listing import Entry, Listing
 from vislam.datasets.bags.pictures import is_depth, size_px
 from vislam.datasets.bags.transforms import Frames
 
 NONE = "none"
-TRUTHS = (POSE, POSE_COVARIANCE, ODOMETRY, TRANSFORM)
 _PAIRS = (
     ("left", "right"), ("cam0", "cam1"), ("cam_0", "cam_1"), ("camera0", "camera1"), ("camera_0", "camera_1"),
     ("infra1", "infra2"), ("fisheye1", "fisheye2"), ("image_0", "image_1"), ("image0", "image1"),
@@ -41,6 +40,7 @@ class BagOptions:
 
     cam0: str | None = None  # topics; none: leave it out
     cam1: str | None = None
+    further: str | None = None  # topics of more cameras, with + between them: followed each by itself
     depth: str | None = None
     imu: str | None = None
     mag: str | None = None
@@ -59,6 +59,7 @@ class ImageFacts:
     size_px: tuple[int, int] | None
     encoding: str
     frame: str
+    is_video: bool = False
 
     @property
     def name(self) -> str:
@@ -97,7 +98,7 @@ class Choice:
 
 def chosen(listing: Listing, options: BagOptions, frames: Frames) -> Choice:
     """Return which topic is which sensor; raises DataError for one that was given and is not there or of no use."""
-    images = [_facts(listing, entry) for entry in listing.of_type(IMAGE, COMPRESSED)]
+    images = [_facts(listing, entry) for entry in listing.of_type(*IMAGES)]
     usual = [facts for facts in images if facts.size_px is not None]
     colors = [facts for facts in usual if not _looks_like_depth(facts)]
     depths = [facts for facts in usual if _looks_like_depth(facts)]
@@ -107,6 +108,9 @@ def chosen(listing: Listing, options: BagOptions, frames: Frames) -> Choice:
     told_depth = _image(listing, images, "depth", options.depth, None)
     cam1 = _image(listing, images, "cam1", options.cam1, None if told_depth else of_guess)
     cameras = tuple(camera for camera in (cam0, cam1) if camera is not None and cam0 is not None)
+    if options.further:
+        more = (_image(listing, images, "further", topic, None) for topic in options.further.split("+"))
+        cameras = _one_each((*cameras, *(camera for camera in more if camera is not None)))
     depth = told_depth
     if depth is None and options.depth is None and cam0 is not None and len(cameras) == 1:
         fitting = [facts for facts in depths if _registered(facts, cam0)]
@@ -121,7 +125,7 @@ def chosen(listing: Listing, options: BagOptions, frames: Frames) -> Choice:
         )
     infos = tuple(
         _entry(listing, f"info{k}", given, (CAMERA_INFO,), _info(listing, camera, len(cameras)))
-        for k, (camera, given) in enumerate(zip(cameras, (options.info0, options.info1), strict=False))
+        for k, (camera, given) in enumerate(zip_longest(cameras, (options.info0, options.info1)[: len(cameras)]))
     )
     mags = listing.of_type(MAGNETIC)
     return Choice(
@@ -131,8 +135,20 @@ def chosen(listing: Listing, options: BagOptions, frames: Frames) -> Choice:
         depth_info,
         *_imu(listing, options.imu),
         _entry(listing, "mag", options.mag, (MAGNETIC,), max(mags, key=lambda entry: entry.count, default=None)),
-        _entry(listing, "truth", options.truth, TRUTHS, None),
+        _entry(listing, "truth", options.truth, POSES, None),
     )
+
+
+def _one_each(cameras: tuple[ImageFacts, ...]) -> tuple[ImageFacts, ...]:
+    """Return cameras; raises DataError for one that comes twice, for more than a rig has, or without a first one."""
+    names = [camera.name for camera in cameras]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise DataError(f"{twice} is named as two cameras; name each once: cam0, cam1, further")
+    if len(cameras) > MOST_CAMERAS:
+        raise DataError(
+            f"a rig has {MOST_CAMERAS} cameras at most, {len(cameras)} are named; leave some out of further"
+        )
+    return cameras
 
 
 def topics_there(listing: Listing, types: Iterable[str] = ()) -> str:
@@ -167,7 +183,7 @@ def _entry(
 def _image(
     listing: Listing, images: list[ImageFacts], role: str, given: str | None, guessed: ImageFacts | None
 ) -> ImageFacts | None:
-    entry = _entry(listing, role, given, (IMAGE, COMPRESSED), None if guessed is None else guessed.entry)
+    entry = _entry(listing, role, given, IMAGES, None if guessed is None else guessed.entry)
     if entry is None:
         return None
     facts = next(facts for facts in images if facts.entry is entry)
@@ -177,7 +193,11 @@ def _image(
 
 
 def _facts(listing: Listing, entry: Entry) -> ImageFacts:
-    compressed = entry.topic.type == COMPRESSED
+    compressed = entry.topic.type != IMAGE
+    first = next(listing.first_messages(entry), None)
+    if compressed and first is not None and codec_of(str(first.format)):  # also as a CompressedImage
+        size = None if why_no_video() else film_size(listing.first_messages(entry), len(entry.places))
+        return ImageFacts(entry, True, size, str(first.format), str(first.header.frame_id), True)
     for message in listing.first_messages(entry):
         size = size_px(message, compressed)
         if size is not None:

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from vislam.core.reading import open_file
-from vislam.datasets.bags.stored import MOST_MESSAGE_BYTES, DamagedError, Place
+from vislam.datasets.bags.stored import DamagedError, Place
 
 MOST_CHUNK_BYTES = 2**27  # unpacked; recorders make chunks of 1 to 16 MiB, and of one image where that is more
-_KEPT_BYTES = 2**26  # of unpacked chunks, so that images and inertial samples of one stretch unpack it once
+_FREE_CHUNK_BYTES, _MOST_RATIO = 2**25, 1000  # unpacked: a dark image of 8K, or what any other packs to
+_KEPT_BYTES = 2**25  # of unpacked chunks beside the newest: images and samples of one stretch unpack it once
 _WINDOW_BYTES = 2**14
 _PIECE_BYTES = 2**14
 
@@ -115,8 +116,8 @@ def unpacked(data: bytes, method: str, declared: int) -> tuple[bytes, bool]:
     Damage in the middle leaves what came before it. Raises DamagedError for a method that is unknown and for a chunk
     that is larger than any recorder's, declared or not.
     """
-    if declared > MOST_CHUNK_BYTES:
-        raise DamagedError(f"chunk of {declared} bytes, more than the {MOST_CHUNK_BYTES} that are unpacked")
+    if declared > (most := min(MOST_CHUNK_BYTES, _FREE_CHUNK_BYTES + _MOST_RATIO * len(data))):
+        raise DamagedError(f"chunk of {declared} bytes, more than the {most} that are unpacked of its size")
     try:
         out = _decompressor(method).decompress(data, declared + 1)
     except _errors(method):
@@ -126,14 +127,14 @@ def unpacked(data: bytes, method: str, declared: int) -> tuple[bytes, bool]:
     return out, len(out) == declared
 
 
-def unpacked_message(data: bytes, head_bytes: int | None = None) -> bytes:
+def unpacked_message(data: bytes, most_bytes: int, head_bytes: int | None = None) -> bytes:
     """Return a message that a recorder packed by zstd for itself, or its first bytes; raises DamagedError."""
     try:
-        out: bytes = _decompressor("zstd").decompress(data, head_bytes or MOST_MESSAGE_BYTES + 1)
+        out: bytes = _decompressor("zstd").decompress(data, head_bytes or most_bytes + 1)
     except _errors("zstd") as error:
         raise DamagedError(f"message that cannot be unpacked: {error}") from error
-    if len(out) > MOST_MESSAGE_BYTES:
-        raise DamagedError("message that unpacks to more than any image")
+    if len(out) > most_bytes:
+        raise DamagedError("message that unpacks to far more than its size or its camera justifies")
     return out
 
 

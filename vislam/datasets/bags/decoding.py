@@ -8,28 +8,44 @@ from __future__ import annotations
 
 import struct
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 from vislam.core.errors import DataError, install_line
 from vislam.datasets.bags import foxglove
+from vislam.datasets.bags.films import why_no_video
 from vislam.datasets.bags.stored import DamagedError, Topic
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+VIDEO, PACKET = "foxglove_msgs/msg/CompressedVideo", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+VIDEOS = (VIDEO, PACKET)
+IMAGES = (IMAGE, COMPRESSED, *VIDEOS)
 CAMERA_INFO, IMU, MAGNETIC = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
 FIX, RANGE, PRESSURE = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Range", "sensor_msgs/msg/FluidPressure"
 ODOMETRY, TWIST, JOINTS = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/JointState"
 TWIST_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 POSE, POSE_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+PATH, POINT = "nav_msgs/msg/Path", "geometry_msgs/msg/PointStamped"  # these two of evaluations alone
 TRANSFORM, TRANSFORMS, OLD_TRANSFORMS = (
     "geometry_msgs/msg/TransformStamped",
     "tf2_msgs/msg/TFMessage",
     "tf/msg/tfMessage",
 )
+POSES = (ODOMETRY, POSE, POSE_COVARIANCE, TRANSFORM)
 KNOWN = (
-    IMAGE, COMPRESSED, CAMERA_INFO, IMU, MAGNETIC, FIX, RANGE, PRESSURE, ODOMETRY, TWIST, TWIST_COVARIANCE, JOINTS,
-    POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, OLD_TRANSFORMS,
+    *IMAGES, CAMERA_INFO, IMU, MAGNETIC, FIX, RANGE, PRESSURE, ODOMETRY, TWIST, TWIST_COVARIANCE, JOINTS,
+    POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, OLD_TRANSFORMS, PATH, POINT,
 )  # fmt: skip
 _TRANSFORMS_SUM = "94810edda583a504dfda3829e70d7eec"
+_VIDEO_FIELDS = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+_PACKET_1 = (
+    "std_msgs/Header header\nuint8[] data\nint32 img_width\nint32 img_height\nstring encoding\nuint64 pts\nuint8 flags"
+)
+_PACKET_2 = (
+    "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\nbool is_bigendian\n"
+    "uint8[] data"
+)
+_UT_PER_TESLA = 1e6
 _STAMP = {"<": struct.Struct("<iI"), ">": struct.Struct(">iI")}
 _ROS1_STAMP = struct.Struct("<III")
 
@@ -46,6 +62,8 @@ def why_unreadable(topic: Topic) -> str:
     """Return why messages of a topic cannot be decoded, empty when they can."""
     if topic.type not in KNOWN:
         return "a type that vislam does not read"
+    if topic.type in VIDEOS and (lacks := why_no_video()):
+        return lacks
     if topic.schema:
         return topic.refused
     if topic.encoding not in ("ros1", "cdr"):
@@ -63,17 +81,27 @@ def decoded(topic: Topic, data: bytes) -> Any:
     type_ = TRANSFORMS if topic.type == OLD_TRANSFORMS else topic.type
     try:
         if topic.encoding == "ros1":
-            return ros1.deserialize_ros1(data, type_)
+            return _of_video(type_, ros1.deserialize_ros1(data, type_))
         if data[:2] not in (b"\x00\x00", b"\x00\x01"):  # neither order of bytes; others are not plain CDR
             raise DamagedError("message in another representation than plain CDR")
         try:
-            return ros2[0].deserialize_cdr(data, type_)
+            return _of_video(type_, ros2[0].deserialize_cdr(data, type_))
         except Exception:
             return ros2[1].deserialize_cdr(data, type_)  # later ones have further fields
     except DamagedError:
         raise
     except Exception as error:  # of whatever kind: these bytes may be anything, and that code is another's
         raise DamagedError(f"message that cannot be read as {topic.type}") from error
+
+
+def _of_video(type_: str, message: Any) -> Any:
+    """Return a message, one of video with the fields of a CompressedImage."""
+    if type_ == VIDEO:
+        header = SimpleNamespace(stamp=message.timestamp, frame_id=message.frame_id)
+        return SimpleNamespace(header=header, format=message.format, data=message.data)
+    if type_ == PACKET:
+        return SimpleNamespace(header=message.header, format=message.encoding, data=message.data)
+    return message
 
 
 def stamp_ns(topic: Topic, head: bytes) -> int | None:
@@ -83,7 +111,7 @@ def stamp_ns(topic: Topic, head: bytes) -> int | None:
         return None if stamp is None else _whole_ns(*stamp)
     try:
         if topic.encoding == "ros1":
-            _sequence, seconds, rest_ns = _ROS1_STAMP.unpack_from(head)
+            _sequence, seconds, rest_ns = _ROS1_STAMP.unpack_from(bytes(4) + head if topic.type == VIDEO else head)
         else:
             seconds, rest_ns = _STAMP["<" if head[1:2] == b"\x01" else ">"].unpack_from(head, 4)
     except struct.error:
@@ -94,6 +122,22 @@ def stamp_ns(topic: Topic, head: bytes) -> int | None:
 def header_ns(header: Any) -> int | None:
     """Return the stamp in a decoded header, as `stamp_ns`."""
     return _whole_ns(int(header.stamp.sec), int(header.stamp.nanosec))
+
+
+def pose_numbers(message: Any) -> list[float]:
+    """Return position and quaternion x y z w in a message of one of POSES."""
+    if hasattr(message, "transform"):
+        p, q = message.transform.translation, message.transform.rotation
+    else:
+        pose = getattr(message.pose, "pose", message.pose)  # within its covariance
+        p, q = pose.position, pose.orientation
+    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+
+
+def field_ut(message: Any) -> list[float]:
+    """Return the field in a message of MAGNETIC."""
+    field = message.magnetic_field
+    return [field.x * _UT_PER_TESLA, field.y * _UT_PER_TESLA, field.z * _UT_PER_TESLA]
 
 
 def _whole_ns(seconds: int, rest_ns: int) -> int | None:
@@ -109,7 +153,10 @@ def _stores() -> tuple[Any, Any, Any]:
 
     ros1 = get_typestore(Stores.ROS1_NOETIC)
     ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    return ros1, get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.LATEST)
+    humble = get_typestore(Stores.ROS2_HUMBLE)
+    for store, packet in ((ros1, _PACKET_1), (humble, _PACKET_2)):
+        store.register(get_types_from_msg(_VIDEO_FIELDS, VIDEO) | get_types_from_msg(packet, PACKET))
+    return ros1, humble, get_typestore(Stores.LATEST)
 
 
 @cache

@@ -24,6 +24,7 @@ ROS_TYPES = {
     "foxglove.CameraCalibration": "sensor_msgs/msg/CameraInfo", "foxglove.LocationFix": "sensor_msgs/msg/NavSatFix",
     "foxglove.FrameTransform": "tf2_msgs/msg/TFMessage", "foxglove.FrameTransforms": "tf2_msgs/msg/TFMessage",
     "foxglove.PoseInFrame": "geometry_msgs/msg/PoseStamped",
+    "foxglove.CompressedVideo": "foxglove_msgs/msg/CompressedVideo",
 }  # fmt: skip
 
 
@@ -67,6 +68,10 @@ _MESSAGES: dict[str, dict[str, _Field]] = {
     "foxglove.PoseInFrame": {
         "timestamp": _Field(1, _TIME), "frame_id": _Field(2, _TEXT), "pose": _Field(3, "foxglove.Pose"),
     },
+    "foxglove.CompressedVideo": {
+        "timestamp": _Field(1, _TIME), "frame_id": _Field(2, _TEXT), "data": _Field(3, _BYTES),
+        "format": _Field(4, _TEXT),
+    },
 }  # fmt: skip
 _VARINT, _EIGHT, _LENGTH, _FOUR = 0, 1, 2, 5  # how a value lies
 _LIES: dict[int | str, int] = {
@@ -81,6 +86,7 @@ _MOST_NUMBERS = 1000  # in a list of numbers
 _MOST_TEXT_BYTES = 2**16
 _MOST_DEFINITION_BYTES = 2**18
 _MOST_JSON_BYTES = 2**24  # what is parsed takes several times as much memory
+_MATRICES = {"K": 9, "R": 9, "P": 12}
 _F64, _U32 = struct.Struct("<d"), struct.Struct("<I")
 
 
@@ -103,7 +109,20 @@ def why_refused(schema: str, encoding: str, definition: bytes) -> str:
 def decoded(schema: str, encoding: str, data: bytes) -> Any:
     """Return a message with the fields of the ROS message that it stands for; raises DamagedError."""
     values = _of_protobuf(schema, data) if encoding == PROTOBUF else _of_json(schema, _loaded(data))
-    return _AS_ROS[schema](values)
+    if schema == "foxglove.CameraCalibration":
+        values |= {name: [0.0] * size for name, size in _MATRICES.items() if len(values[name]) != size}
+    message = _named(values)
+    if schema == "foxglove.RawImage":
+        message.is_bigendian = 0
+    if schema == "foxglove.LocationFix":
+        message.status = SimpleNamespace(status=0)
+        message.position_covariance_type *= len(message.position_covariance) == 9
+    if ROS_TYPES[schema] != "tf2_msgs/msg/TFMessage":
+        return message
+    transforms = getattr(message, "transforms", [message])
+    for one in transforms:
+        one.transform = SimpleNamespace(translation=one.translation, rotation=one.rotation)
+    return SimpleNamespace(transforms=transforms)
 
 
 def stamp(schema: str, encoding: str, head: bytes) -> tuple[int, int] | None:
@@ -324,72 +343,17 @@ def _time(given: Any) -> dict[str, Any]:
     return {"seconds": given.get("sec"), "nanos": given.get("nsec")}
 
 
-def _header(values: dict[str, Any], frame: str = "frame_id") -> SimpleNamespace:
-    time = values["timestamp"]
-    return SimpleNamespace(
-        stamp=SimpleNamespace(sec=time["seconds"], nanosec=time["nanos"] % 2**32), frame_id=values[frame]
-    )
-
-
-def _bytes(values: dict[str, Any]) -> Any:
-    return np.frombuffer(values["data"], dtype=np.uint8)
-
-
-def _raw_image(values: dict[str, Any]) -> SimpleNamespace:
-    return SimpleNamespace(
-        header=_header(values), width=values["width"], height=values["height"], encoding=values["encoding"],
-        step=values["step"], is_bigendian=0, data=_bytes(values),
-    )  # fmt: skip
-
-
-def _compressed_image(values: dict[str, Any]) -> SimpleNamespace:
-    return SimpleNamespace(header=_header(values), format=values["format"], data=_bytes(values))
-
-
-def _calibration(values: dict[str, Any]) -> SimpleNamespace:
-    sized = {name: values[name] if len(values[name]) == size else [0.0] * size for name, size in _MATRICES.items()}
-    return SimpleNamespace(
-        header=_header(values), width=values["width"], height=values["height"],
-        distortion_model=values["distortion_model"], d=values["D"], k=sized["K"], r=sized["R"], p=sized["P"],
-    )  # fmt: skip
-
-
-_MATRICES = {"K": 9, "R": 9, "P": 12}
-
-
-def _point(values: dict[str, Any]) -> SimpleNamespace:
-    return SimpleNamespace(**values)
-
-
-def _transform(values: dict[str, Any]) -> SimpleNamespace:
-    transform = SimpleNamespace(translation=_point(values["translation"]), rotation=_point(values["rotation"]))
-    header = _header(values, "parent_frame_id")
-    return SimpleNamespace(header=header, child_frame_id=values["child_frame_id"], transform=transform)
-
-
-def _fix(values: dict[str, Any]) -> SimpleNamespace:
-    covariance = values["position_covariance"]
-    return SimpleNamespace(
-        header=_header(values), status=SimpleNamespace(status=0), latitude=values["latitude"],
-        longitude=values["longitude"], altitude=values["altitude"], position_covariance=covariance,
-        position_covariance_type=values["position_covariance_type"] if len(covariance) == 9 else 0,
-    )  # fmt: skip
-
-
-def _pose(values: dict[str, Any]) -> SimpleNamespace:
-    pose = values["pose"]
-    where = SimpleNamespace(position=_point(pose["position"]), orientation=_point(pose["orientation"]))
-    return SimpleNamespace(header=_header(values), pose=where)
-
-
-_AS_ROS = {
-    "foxglove.RawImage": _raw_image,
-    "foxglove.CompressedImage": _compressed_image,
-    "foxglove.CameraCalibration": _calibration,
-    "foxglove.FrameTransform": lambda values: SimpleNamespace(transforms=[_transform(values)]),
-    "foxglove.FrameTransforms": lambda values: SimpleNamespace(
-        transforms=[_transform(t) for t in values["transforms"]]
-    ),
-    "foxglove.LocationFix": _fix,
-    "foxglove.PoseInFrame": _pose,
-}
+def _named(values: Any) -> Any:
+    """Return the fields of a message as attributes, stamp and frame as ROS's header, bytes as an array."""
+    if isinstance(values, bytes):
+        return np.frombuffer(values, dtype=np.uint8)
+    if isinstance(values, list):
+        return [_named(value) for value in values]
+    if not isinstance(values, dict):
+        return values
+    named = SimpleNamespace(**{key: _named(value) for key, value in values.items()})
+    if "timestamp" in values:
+        stamp = SimpleNamespace(sec=named.timestamp.seconds, nanosec=named.timestamp.nanos % 2**32)
+        frame = values["parent_frame_id" if "parent_frame_id" in values else "frame_id"]
+        named.header = SimpleNamespace(stamp=stamp, frame_id=frame)
+    return named

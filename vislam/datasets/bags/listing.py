@@ -14,16 +14,17 @@ from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.decoding import (
     COMPRESSED,
-    IMAGE,
+    IMAGES,
     OLD_TRANSFORMS,
     TRANSFORMS,
+    VIDEOS,
     decoded,
     stamp_ns,
     why_unreadable,
 )
 from vislam.datasets.bags.stored import DamagedError, Found, Place, Topic
 
-_PLACES_KEPT = 1000  # of transforms
+_PLACES_KEPT = 1000  # of transforms, and of video until a frame that needs no other
 _FIRST_KEPT = 5  # of all else, as the very first may be damaged
 _COLUMNS = 5  # stamp, and the four numbers of a place
 
@@ -75,10 +76,10 @@ class Listing:
         entry.count += 1
         entry.first_log_ns = min(entry.first_log_ns, found.log_ns)
         entry.last_log_ns = max(entry.last_log_ns, found.log_ns)
-        most = _PLACES_KEPT if entry.topic.type in (TRANSFORMS, OLD_TRANSFORMS) else _FIRST_KEPT
+        most = _PLACES_KEPT if entry.topic.type in (TRANSFORMS, OLD_TRANSFORMS, COMPRESSED, *VIDEOS) else _FIRST_KEPT
         if len(entry.places) < most:
             entry.places.append(found.place)
-        if entry.topic.type in (IMAGE, COMPRESSED):
+        if entry.topic.type in IMAGES:
             t_ns = stamp(found, self._by_log_time)
             if t_ns is None and found.topic.schema:
                 t_ns = self._stamp_behind(found)

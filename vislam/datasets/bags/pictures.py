@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from vislam.core.camera import Camera
 from vislam.core.encoded_image import image_size
 from vislam.core.messages import ImageF32, ImageU8
-from vislam.datasets.images import DepthFormat, UnreadableImageError, check_size_px, decode_image
+from vislam.datasets.images import (
+    DepthFormat,
+    SixteenBits,
+    UnreadableImageError,
+    check_size_px,
+    decode_raw_depth,
+    decode_stored,
+    grey_and_color,
+)
 
 _DEPTH_UNITS_PER_M = 1000.0  # as ROS defines 16UC1
 _DEPTH_HEAD = struct.Struct("<iff")  # of `compressedDepth`: kind, and what turns its numbers into an inverse depth
@@ -62,23 +70,25 @@ def size_px(message: Any, compressed: bool) -> tuple[int, int] | None:
     return image_size(data[_DEPTH_HEAD.size :] if "compressedDepth" in message.format else data)
 
 
-def grey_or_color(message: Any, camera: Camera, path: Path) -> tuple[ImageU8, ImageU8 | None]:
-    """Return an Image as grey [H, W] and, if it has colour, as BGR [H, W, 3]; of 16 bits the upper 8.
-
-    Raises UnreadableImageError when it is damaged, DataError when it is not of the camera's size.
-    """
+def stored_pixels(message: Any, camera: Camera, path: Path) -> NDArray[Any]:
+    """Return the pixels of an Image [H, W, channels] as they are stored; raises as `grey_or_color`."""
     layout = ENCODINGS.get(message.encoding)
     if layout is None or layout.dtype == "f4":
         raise UnreadableImageError(f"image encoded as '{message.encoding[:20]}', which is no camera's here", path)
-    pixels = _pixels(message, layout, camera, path)
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
+    return _pixels(message, layout, camera, path)
+
+
+def grey_or_color(message: Any, camera: Camera, path: Path, bits: SixteenBits) -> tuple[ImageU8, ImageU8 | None]:
+    """Return an Image as grey [H, W] and, if it has colour, as BGR [H, W, 3]; `bits` are its topic's.
+
+    Raises UnreadableImageError when it is damaged, DataError when it is not of the camera's size.
+    """
+    pixels, layout = bits.reduced(stored_pixels(message, camera, path)), ENCODINGS[message.encoding]
     if layout.channels == 1 and layout.to_bgr is None:
         return np.array(pixels[:, :, 0], dtype=np.uint8, order="C"), None
     try:
         bgr = pixels if layout.to_bgr is None else cv2.cvtColor(np.ascontiguousarray(pixels), layout.to_bgr)
-        color = np.ascontiguousarray(bgr, dtype=np.uint8)
-        return np.asarray(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY), dtype=np.uint8), color
+        return grey_and_color(np.ascontiguousarray(bgr, dtype=np.uint8))
     except cv2.error as error:  # as of half a pair of pixels
         raise UnreadableImageError(_UNREADABLE, path) from error
 
@@ -94,13 +104,9 @@ def depth_m(message: Any, camera: Camera, path: Path) -> ImageF32:
     return np.where(np.isfinite(pixels) & (pixels > 0.0), pixels, np.float32(0.0)).astype(np.float32)
 
 
-def unpacked_grey_or_color(message: Any, camera: Camera, path: Path) -> tuple[ImageU8, ImageU8 | None]:
-    """Return a CompressedImage (JPEG or PNG) as `grey_or_color` does."""
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = np.asarray(decode_image(message.data.tobytes(), camera, flags, path), dtype=np.uint8)
-    if image.ndim == 2:
-        return image, None
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8), image
+def unpacked_pixels(message: Any, camera: Camera, path: Path) -> NDArray[Any]:
+    """Return the image of a CompressedImage (JPEG or PNG) as it is stored; raises as `grey_or_color`."""
+    return decode_stored(message.data.tobytes(), camera, path)
 
 
 def unpacked_depth_m(message: Any, camera: Camera, path: Path) -> ImageF32:
@@ -112,11 +118,9 @@ def unpacked_depth_m(message: Any, camera: Camera, path: Path) -> ImageF32:
             raise UnreadableImageError(_UNREADABLE, path)
         _, a, b = _DEPTH_HEAD.unpack_from(data)
         data = data[_DEPTH_HEAD.size :]
-    raw = decode_image(data, camera, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION, path)
-    if raw.dtype != np.uint16 or raw.ndim != 2:
-        raise UnreadableImageError("depth image that is not 16-bit grey", path)
+    raw = decode_raw_depth(data, camera, path)
     if not message.format.startswith("32FC1"):
-        return DepthFormat(_DEPTH_UNITS_PER_M).in_m(np.asarray(raw, dtype=np.uint16))
+        return DepthFormat(_DEPTH_UNITS_PER_M).in_m(raw)
     numbers = raw.astype(np.float32)
     with np.errstate(all="ignore"):
         depth = np.float32(a) / (numbers - np.float32(b))

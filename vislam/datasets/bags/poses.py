@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError
 from vislam.core.recording import Problems
@@ -15,33 +16,33 @@ from vislam.core.trajectory import Trajectory
 from vislam.datasets.bags.bag import Bag
 from vislam.datasets.bags.choice import topics_there, wanted_topic
 from vislam.datasets.bags.decoding import (
-    ODOMETRY,
     OLD_TRANSFORMS,
-    POSE,
-    POSE_COVARIANCE,
-    TRANSFORM,
+    PATH,
+    POINT,
+    POSES,
     TRANSFORMS,
     decoded,
     header_ns,
     need_rosbags,
+    pose_numbers,
 )
 from vislam.datasets.bags.listing import Entry, Listing
-from vislam.datasets.bags.stored import DamagedError, Found, Topic
+from vislam.datasets.bags.stored import DamagedError, Found
 from vislam.datasets.bags.streams import topic_rows
 from vislam.datasets.formats.truth import trajectory_of
 from vislam.datasets.tables import Row
 
-_PATH, _POINT = "nav_msgs/msg/Path", "geometry_msgs/msg/PointStamped"
-_SUMS = {_PATH: "6227e2b7e9cce15051f669a5e197bbf7", _POINT: "c63aecb41bfdfd6b7e1fac37c7cbe7bf"}  # of ROS 1
 _TREES, _MOST_EDGES = (TRANSFORMS, OLD_TRANSFORMS), 100
+_ALWAYS = 2**62  # before every stamp: since when static transforms hold
+_LEAST_NORM = 0.5  # of a quaternion
 _NO_ROTATION = [0.0, 0.0, 0.0, 0.0]
 
 
 def trajectory_of_topic(path: Path, name: str) -> tuple[Trajectory, str]:
     """Return the poses on a topic of a bag and in words what was read; without a name, of its only topic of poses.
 
-    Of paths it is the longest message, the last of several; of transforms `TOPIC:PARENT:CHILD` the one between two
-    frames, which must stand in the messages as such.
+    Of paths it is the longest message, the last of several; of transforms `TOPIC:PARENT:CHILD` those between two
+    frames, of which one lies above the other.
 
     Raises:
         DataError: there is no such topic, several and no name, or none of its messages can be used.
@@ -54,8 +55,11 @@ def trajectory_of_topic(path: Path, name: str) -> tuple[Trajectory, str]:
         rows: Iterable[Row[list[float]]]
         if edge:
             rows = _of_tree(bag, entry, edge)
+        elif entry.topic.type == PATH:
+            rows = _of_path(bag, entry)
         else:
-            rows = _of_path(bag, entry) if entry.topic.type == _PATH else _one_by_one(bag, entry, problems)
+            values = _place if entry.topic.type == POINT else pose_numbers
+            rows = topic_rows(bag, entry.topic, values, False, problems)
         found = trajectory_of(rows, problems, np.eye(4))
     if found is None:
         raise DataError(f"{path}: no message on {entry.topic.name} ({entry.topic.type}) holds a pose that can be used")
@@ -69,7 +73,7 @@ def trajectory_of_topic(path: Path, name: str) -> tuple[Trajectory, str]:
 def _wanted(listing: Listing, name: str, is_tree: bool) -> Entry:
     if is_tree:
         return wanted_topic(listing, "topic", name, _TREES)
-    types = (*_VALUES, _PATH)
+    types = (*POSES, POINT, PATH)
     if not name:
         fitting = [entry for entry in listing.entries.values() if entry.topic.type in types]
         if len(fitting) != 1:
@@ -79,24 +83,7 @@ def _wanted(listing: Listing, name: str, is_tree: bool) -> Entry:
     entry = listing.entries.get(name) or listing.entries.get(f"/{name}")
     if entry is not None and entry.topic.type in _TREES:
         raise DataError(f"topic={name}: it holds transforms between many frames; name two: {name}:odom:base_link")
-    if entry is None or entry.topic.type not in _SUMS:
-        return wanted_topic(listing, "topic", name, types)
-    if why := _why_unreadable(entry.topic):
-        raise DataError(f"topic={name}: {why}")
-    return entry
-
-
-def _why_unreadable(topic: Topic) -> str:
-    """Return what `decoding.why_unreadable` would of the types that are read for evaluation alone."""
-    if topic.encoding not in ("ros1", "cdr"):
-        return f"encoded as '{topic.encoding}'; ros1 and cdr are read"
-    if topic.encoding == "ros1" and topic.digest not in ("", "*", _SUMS[topic.type]):
-        return f"its definition of {topic.type} is not the standard one"
-    return ""
-
-
-def _one_by_one(bag: Bag, entry: Entry, problems: Problems) -> Iterator[Row[list[float]]]:
-    return topic_rows(bag, entry.topic, _VALUES[entry.topic.type], False, problems)
+    return wanted_topic(listing, "topic", name, types)
 
 
 def _of_path(bag: Bag, entry: Entry) -> list[Row[list[float]]]:
@@ -114,45 +101,55 @@ def _of_path(bag: Bag, entry: Entry) -> list[Row[list[float]]]:
     stamps = [header_ns(pose.header) for pose in poses]
     if len({*stamps}) < len(poses) / 2 or None in stamps:
         raise DataError(f"{bag.path}: the poses of {entry.topic.name} have no times of their own; give another topic")
-    rows = [(t_ns, _pose(pose.pose)) for t_ns, pose in zip(stamps, poses, strict=True) if t_ns is not None]
+    rows = [(t_ns, pose_numbers(pose)) for t_ns, pose in zip(stamps, poses, strict=True) if t_ns is not None]
     return [row for row in rows if np.isfinite(row[1]).all()]
 
 
 def _of_tree(bag: Bag, entry: Entry, edge: list[str]) -> list[Row[list[float]]]:
-    """Return the transforms from a parent to its child, in all messages of a topic."""
-    wanted, there = tuple(name.strip("/") for name in edge), dict[tuple[str, ...], int]()
-    rows: list[Row[list[float]]] = []
+    """Return the transforms from a frame to one below it, in all messages of a topic and of static ones.
+
+    Of a chain they come at the stamps of the transform with most of them; of the others the latest holds.
+    """
+    wanted, edges = tuple(name.strip("/") for name in edge), dict[tuple[str, str], list[Row[list[float]]]]()
     for found in bag.scan(Problems()):  # damage was counted when it was listed
-        if found.topic.name != entry.topic.name:
+        is_static = found.topic.type == entry.topic.type and "static" in found.topic.name
+        if found.topic.name != entry.topic.name and not is_static:
             continue
         with suppress(DamagedError, OSError):
-            for one in decoded(entry.topic, bag.read(found.place)).transforms:
+            for one in decoded(found.topic, bag.read(found.place)).transforms:
                 frames = (one.header.frame_id.strip("/"), one.child_frame_id.strip("/"))
-                t_ns = header_ns(one.header)
-                if frames == wanted and t_ns is not None and np.isfinite(row := _transform(one)).all():
-                    rows.append((t_ns, row))
-                elif len(there) < _MOST_EDGES:
-                    there[frames] = there.get(frames, 0) + 1
-    if not rows:
-        named = ", ".join(":".join(frames) for frames in sorted(there))
+                t_ns = header_ns(one.header) or found.log_ns
+                if (frames in edges or len(edges) < _MOST_EDGES) and np.isfinite(row := pose_numbers(one)).all():
+                    edges.setdefault(frames, []).append((-_ALWAYS if is_static else t_ns, row))
+    chain: list[list[Row[list[float]]]] = []
+    above = {child: parent for parent, child in edges}
+    at = wanted[-1]
+    while at in above and at != wanted[0] and len(chain) < _MOST_EDGES:
+        chain.insert(0, edges[above[at], at])
+        at = above[at]
+    if (at, len(wanted)) != (wanted[0], 2) or all(t_ns == -_ALWAYS for rows in chain for t_ns, _ in rows):
+        named = ", ".join(":".join(frames) for frames in sorted(edges))
         raise DataError(f"{bag.path}: no transform {':'.join(edge)} on {entry.topic.name}; there are {named[:300]}")
-    return rows
+    return chain[0] if len(chain) == 1 else _joined(chain)
 
 
-def _pose(pose: Any) -> list[float]:
-    p, q = pose.position, pose.orientation
-    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+def _joined(chain: list[list[Row[list[float]]]]) -> list[Row[list[float]]]:
+    """Return the product of transforms, each at the last of its stamps, from where all of them have begun."""
+    tables = [sorted(row for row in rows if np.linalg.norm(row[1][3:]) > _LEAST_NORM) for rows in chain]
+    if not all(tables):
+        return []
+    t_ns = np.array([row[0] for row in max(tables, key=len)], dtype=np.int64)
+    t_ns = t_ns[t_ns >= max(rows[0][0] for rows in tables)]
+    T = np.tile(np.eye(4), (len(t_ns), 1, 1))
+    for rows in tables:
+        numbers = np.array([row[1] for row in rows])
+        held = numbers[np.searchsorted([row[0] for row in rows], t_ns, side="right") - 1]
+        step = np.tile(np.eye(4), (len(t_ns), 1, 1))
+        step[:, :3, :3], step[:, :3, 3] = Rotation.from_quat(held[:, 3:]).as_matrix(), held[:, :3]
+        T = T @ step
+    poses = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+    return list(zip(t_ns.tolist(), poses.tolist(), strict=True))
 
 
-def _transform(message: Any) -> list[float]:
-    p, q = message.transform.translation, message.transform.rotation
-    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-
-
-_VALUES = {
-    ODOMETRY: lambda message: _pose(message.pose.pose),
-    POSE: lambda message: _pose(message.pose),
-    POSE_COVARIANCE: lambda message: _pose(message.pose.pose),
-    TRANSFORM: _transform,
-    _POINT: lambda message: [message.point.x, message.point.y, message.point.z, *_NO_ROTATION],
-}
+def _place(message: Any) -> list[float]:
+    return [message.point.x, message.point.y, message.point.z, *_NO_ROTATION]

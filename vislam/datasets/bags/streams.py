@@ -5,30 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.core.camera import Camera, Rig
+from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array, ImageF32, ImageU8
 from vislam.core.recording import Problems
 from vislam.datasets.bags import pictures
 from vislam.datasets.bags.bag import Bag
-from vislam.datasets.bags.decoding import decoded
+from vislam.datasets.bags.decoding import decoded, field_ut
+from vislam.datasets.bags.films import Film
 from vislam.datasets.bags.listing import fitting, stamp
 from vislam.datasets.bags.stored import HEAD_BYTES, DamagedError, Found, Place, Topic
-from vislam.datasets.images import UnreadableImageError
+from vislam.datasets.images import SixteenBits, UnreadableImageError, grey_and_color
 from vislam.datasets.imu_pairs import paired
-from vislam.datasets.loaders import FrameTable, LoadedImages
+from vislam.datasets.loaders import FrameTable, LoadedImages, load_cameras
 from vislam.datasets.tables import Row, in_time_order
 from vislam.vision.depth_registration import DepthCamera
 
 _ENOUGH = 20  # messages, and most of them unusable, settle it
-_UT_PER_TESLA = 1e6
 Values = Callable[[Any], list[float]]
 
 
@@ -40,6 +41,8 @@ class ImageTopic:
     compressed: bool
     t_ns: NDArray[np.int64]  # [N]
     places: NDArray[np.int64]  # [N, 4]
+    size_px: tuple[int, int] | None  # of the first
+    is_video: bool
 
 
 class BagStreams:
@@ -94,7 +97,9 @@ class BagStreams:
 
     def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         """Yield stamp and field in µT; as `imu_rows`."""
-        return iter(()) if self._mag is None else topic_rows(self._bag, self._mag, _field, self._by_log_time, problems)
+        return (
+            iter(()) if self._mag is None else topic_rows(self._bag, self._mag, field_ut, self._by_log_time, problems)
+        )
 
     def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> BagLoader:
         """Return what loads the images of frames, of the first `cameras` only if given."""
@@ -113,9 +118,7 @@ class BagStreams:
 
 
 class BagLoader:
-    """Loads frames from the messages of a bag."""
-
-    workers = 2
+    """Loads frames from the messages of a bag, those of video in rising order."""
 
     def __init__(
         self, bag: Bag, frames: FrameTable, cameras: tuple[ImageTopic, ...], depth: ImageTopic | None,
@@ -123,34 +126,42 @@ class BagLoader:
     ) -> None:  # fmt: skip
         self._bag, self._frames, self._cameras, self._depth, self._rig = bag, frames, cameras, depth, rig
         self._depth_camera = rig.cameras[0] if own is None else own.camera
+        self.bits: Sequence[SixteenBits] = [
+            SixteenBits(len(topic.t_ns), partial(self._stored, k)) for k, topic in enumerate(cameras)
+        ]
+        videos = [topic for topic in cameras if topic.is_video]
+        self._films = {topic.topic.name: Film(_reader(bag, topic), len(topic.t_ns)) for topic in videos}
+        self.workers = 1 if videos else 2
 
     def load(self, i: int) -> LoadedImages:
         """Return the images of frame `i`; raises DataError when an image is not of the calibrated size."""
-        images: list[ImageU8] = []
-        color = None
+        rows = self._frames.camera_rows[i].tolist()[: len(self._cameras)]
+        loaded = load_cameras(self._rig, rows, self._grey_or_color)
+        depth_row = int(self._frames.depth_rows[i])
+        if not loaded.images or self._depth is None or depth_row < 0:
+            return loaded
         try:
-            for index, (camera, topic) in enumerate(zip(self._rig.cameras, self._cameras, strict=False)):
-                grey, bgr = self._grey_or_color(topic, int(self._frames.camera_rows[i, index]), camera)
-                images.append(grey)
-                color = bgr if index == 0 else color
+            return replace(loaded, depth_m=self._depth_m(self._depth, depth_row))
         except UnreadableImageError as error:
-            return LoadedImages((), trouble=error)
-        row = int(self._frames.depth_rows[i])
-        if self._depth is None or row < 0:
-            return LoadedImages(tuple(images), color)
-        try:
-            return LoadedImages(tuple(images), color, self._depth_m(self._depth, row))
-        except UnreadableImageError as error:
-            return LoadedImages(tuple(images), color, trouble=error)
+            return replace(loaded, trouble=error)
 
     def close(self) -> None:
         """Nothing is held that the recording does not hold."""
 
-    def _grey_or_color(self, topic: ImageTopic, row: int, camera: Camera) -> tuple[ImageU8, ImageU8 | None]:
+    def _stored(self, camera: int, row: int) -> NDArray[Any]:
+        topic = self._cameras[camera]
         message, path = _message(self._bag, topic, row)
+        pixels = pictures.unpacked_pixels if topic.compressed else pictures.stored_pixels
+        return pixels(message, self._rig.cameras[camera], path)
+
+    def _grey_or_color(self, camera: int, row: int) -> tuple[ImageU8, ImageU8 | None]:
+        topic, bits = self._cameras[camera], self.bits[camera]
+        if (film := self._films.get(topic.topic.name)) is not None:
+            return film.grey_or_color(row, self._rig.cameras[camera], _path(self._bag, topic, row))
         if topic.compressed:
-            return pictures.unpacked_grey_or_color(message, camera, path)
-        return pictures.grey_or_color(message, camera, path)
+            return grey_and_color(bits.reduced(self._stored(camera, row)))
+        message, path = _message(self._bag, topic, row)
+        return pictures.grey_or_color(message, self._rig.cameras[camera], path, bits)
 
     def _depth_m(self, topic: ImageTopic, row: int) -> ImageF32:
         message, path = _message(self._bag, topic, row)
@@ -158,10 +169,18 @@ class BagLoader:
         return (pictures.unpacked_depth_m if topic.compressed else pictures.depth_m)(message, camera, path)
 
 
+def _path(bag: Bag, topic: ImageTopic, row: int) -> Path:
+    return bag.path / topic.topic.name.strip("/") / str(int(topic.t_ns[row]))
+
+
+def _reader(bag: Bag, topic: ImageTopic) -> Callable[[int], Any]:
+    return lambda row: decoded(topic.topic, bag.read(Place(*topic.places[row].tolist()), topic.size_px))
+
+
 def _message(bag: Bag, topic: ImageTopic, row: int) -> tuple[Any, Path]:
-    path = bag.path / topic.topic.name.strip("/") / str(int(topic.t_ns[row]))
+    path = _path(bag, topic, row)
     try:
-        return decoded(topic.topic, bag.read(Place(*topic.places[row].tolist()))), path
+        return _reader(bag, topic)(row), path
     except (DamagedError, OSError) as error:
         raise UnreadableImageError("image message that cannot be read", path) from error
 
@@ -215,8 +234,3 @@ def topic_rows(
 def _inertial(message: Any) -> list[float]:
     w, a = message.angular_velocity, message.linear_acceleration
     return [w.x, w.y, w.z, a.x, a.y, a.z]
-
-
-def _field(message: Any) -> list[float]:
-    field = message.magnetic_field
-    return [field.x * _UT_PER_TESLA, field.y * _UT_PER_TESLA, field.z * _UT_PER_TESLA]

@@ -16,18 +16,19 @@ from vislam.core.geometry import are_rotations, invert
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets.bags.bag import Bag
-from vislam.datasets.bags.choice import NONE, TRUTHS, BagOptions, Choice, ImageFacts, chosen, topics_there
+from vislam.datasets.bags.choice import NONE, BagOptions, Choice, ImageFacts, chosen, topics_there
 from vislam.datasets.bags.decoding import (
-    ODOMETRY,
+    COMPRESSED,
     OLD_TRANSFORMS,
-    POSE,
-    POSE_COVARIANCE,
-    TRANSFORM,
+    POSES,
     TRANSFORMS,
+    VIDEOS,
     header_ns,
     need_rosbags,
+    pose_numbers,
     why_unreadable,
 )
+from vislam.datasets.bags.films import codec_of, why_no_video
 from vislam.datasets.bags.listing import Entry, Listing, fitting
 from vislam.datasets.bags.stored import Topic
 from vislam.datasets.bags.streams import BagStreams, ImageTopic, messages_of
@@ -134,19 +135,26 @@ def _survey(path: Path, whole: _Bag, choice: Choice, options: BagOptions, found:
 def _without_images(path: Path, listing: Listing, choice: Choice) -> DataError | None:
     """Return why a bag without images that can be read is not run, and what it is good for; None if its IMU runs it."""
     kinds = {name: entry.topic.schema or entry.topic.type for name, entry in listing.entries.items()}
-    videos = [name for name, kind in kinds.items() if kind.endswith(_VIDEOS)]
+    videos = {name: words for name, entry in listing.entries.items() if (words := _video(entry, listing))}
     if choice.imu is not None and not videos and not any("Image" in kind for kind in kinds.values()):
         return None
-    poses = [entry.topic.name for entry in listing.of_type(*TRUTHS)]
-    steps = [
-        f"{name} is video, which is not read: record CompressedImage (JPEG), or film as video:FILE"
-        for name in videos[:1]
-    ]
+    poses = [entry.topic.name for entry in listing.of_type(*POSES)]
+    steps = [f"{name} is {words}: record CompressedImage (JPEG)" for name, words in list(videos.items())[:1]]
     if choice.imu is not None:
         steps.append("cam0=none runs without them")
     elif poses:
         steps.append(f"its poses can be evaluated: vislam eval {path} --topic {poses[0]} --reference FILE")
     return DataError("; ".join([f"{path} has no camera images that can be read", topics_there(listing), *steps]))
+
+
+def _video(entry: Entry, listing: Listing) -> str:
+    """Return what a topic of video is that cannot be read, and why; empty for others."""
+    if entry.topic.type not in (COMPRESSED, *VIDEOS):
+        return "video of a kind that is not read" if entry.topic.type.endswith(_VIDEOS) else ""
+    codec = next((str(message.format)[:20] for message in listing.first_messages(entry)), "no codec")
+    if entry.topic.type == COMPRESSED and not codec_of(codec):
+        return ""
+    return f"{codec} {why_no_video() or 'video that cannot be decoded'}"
 
 
 def _forces(listing: Listing, choice: Choice, frames: Frames, body: str) -> tuple[Topic, Array] | None:
@@ -167,7 +175,7 @@ def _noise(path: Path, imu: Entry, found: _Found) -> ImuNoise | None:
     beside = path.with_name(f"{path.name if path.is_dir() else path.stem}.imu.yaml")
     if beside.is_file():
         try:
-            return read_noise(beside)
+            return read_noise(beside, imu.topic.name)
         except DataError as error:
             found.lacking["imu_noise"] = error
             return None
@@ -200,7 +208,7 @@ def _images(facts: ImageFacts, name: str, problems: Problems) -> tuple[ImageList
     t_ns, places = facts.entry.stamps_and_places()
     rows: Iterator[Row[int]] = zip(t_ns.tolist(), range(len(t_ns)), strict=True)
     kept = np.array([row for _, row in in_time_order(rows, problems, name, hole_s=FRAME_HOLE_S)], dtype=np.int64)
-    topic = ImageTopic(facts.entry.topic, facts.compressed, t_ns[kept], places[kept])
+    topic = ImageTopic(facts.entry.topic, facts.compressed, t_ns[kept], places[kept], facts.size_px, facts.is_video)
     return ImageList(name, Path(facts.name.strip("/")), topic.t_ns, tuple(map(str, topic.t_ns.tolist()))), topic
 
 
@@ -298,12 +306,12 @@ def _is_rectified(facts: ImageFacts) -> bool:
 
 def _beside(T_body_cam0: Array | None, infos: list[Any], choice: Choice) -> Array | None:
     """Return where cam1 sits by the rectification of a calibrated pair; None where there is none."""
-    if T_body_cam0 is None or any(info is None for info in infos):
+    if T_body_cam0 is None or any(info is None for info in infos[:2]):
         return None
     P = _matrix(infos[1], "p", (3, 4))
     rotations = [
         np.eye(3) if _is_rectified(facts) else _matrix(info, "r", (3, 3))
-        for facts, info in zip(choice.cameras, infos, strict=True)
+        for facts, info in zip(choice.cameras[:2], infos[:2], strict=True)
     ]
     good = are_rotations(np.array(rotations), 1e-3).all()
     if not good or not np.all(np.isfinite(P)) or P[0, 3] == 0.0 or P[0, 0] <= 0.0:
@@ -363,7 +371,7 @@ def _truth(bag: Bag, entry: Entry, frames: Frames, body: str) -> Truth:
         rows: list[Row[list[float]]] = []
         for found, message in messages_of(bag, entry.topic, problems):
             child = child or str(getattr(message, "child_frame_id", ""))
-            pose = _pose(entry.topic.type, message)
+            pose = pose_numbers(message)
             t_ns = header_ns(message.header)
             T = rigid((pose[0], pose[1], pose[2]), (pose[3], pose[4], pose[5], pose[6]))
             if T is None:
@@ -374,13 +382,3 @@ def _truth(bag: Bag, entry: Entry, frames: Frames, body: str) -> Truth:
         return trajectory_of(rows, problems, np.eye(4) if T_child_body is None else T_child_body)
 
     return read
-
-
-def _pose(type_: str, message: Any) -> list[float]:
-    if type_ == TRANSFORM:
-        t, q = message.transform.translation, message.transform.rotation
-    else:
-        pose = message.pose if type_ == POSE else message.pose.pose
-        assert type_ in (POSE, POSE_COVARIANCE, ODOMETRY)
-        t, q = pose.position, pose.orientation
-    return [t.x, t.y, t.z, q.x, q.y, q.z, q.w]

@@ -20,14 +20,14 @@ from vislam.datasets.bags.decoding import (
     JOINTS,
     MAGNETIC,
     ODOMETRY,
-    POSE,
-    POSE_COVARIANCE,
+    POSES,
     PRESSURE,
     RANGE,
-    TRANSFORM,
     TWIST,
     TWIST_COVARIANCE,
+    field_ut,
     need_rosbags,
+    pose_numbers,
 )
 from vislam.datasets.bags.listing import Entry, Listing, fitting, stamp
 from vislam.datasets.bags.streams import messages_of
@@ -40,7 +40,6 @@ from vislam.sensors.toml import JointsSettings, SensorFile
 _FIXES: dict[int, FixKind] = {0: "single", 1: "differential", 2: "float"}  # 2: anything that a station on earth helps
 _SEA_LEVEL_PA, _SCALE_M, _EXPONENT = 101_325.0, 44_330.8, 0.190_263  # of the standard atmosphere
 _LEAST_PA, _MOST_PA = 10_000.0, 120_000.0  # in the air that one breathes, and a little beyond; a hPa is below
-_UT_PER_TESLA = 1e6
 _NUMBER = re.compile(r"(\d{1,9})$")
 Numbers = Callable[[Any], list[float]]
 
@@ -148,16 +147,6 @@ def _of_wheels(message: Any, values: Any, joints: JointsSettings) -> np.ndarray 
     return both if np.all(np.isfinite(both)) else None
 
 
-def _pose(pose: Any) -> list[float]:
-    p, q = pose.position, pose.orientation
-    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-
-
-def _transform(message: Any) -> list[float]:
-    p, q = message.transform.translation, message.transform.rotation
-    return [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-
-
 def _twist(twist: Any) -> list[float]:
     return [twist.linear.x, twist.angular.z]
 
@@ -187,18 +176,7 @@ def _anchored(message: Any) -> list[float]:
     return [float(number[1]), _distance(message)]
 
 
-def _field(message: Any) -> list[float]:
-    field = message.magnetic_field
-    return [field.x * _UT_PER_TESLA, field.y * _UT_PER_TESLA, field.z * _UT_PER_TESLA]
-
-
 _PLACE = ("east_m", "north_m", "up_m")
-_POSES: dict[str, Numbers] = {
-    POSE: lambda message: _pose(message.pose),
-    POSE_COVARIANCE: lambda message: _pose(message.pose.pose),
-    ODOMETRY: lambda message: _pose(message.pose.pose),
-    TRANSFORM: _transform,
-}
 
 
 def _of_twists(values: Numbers) -> dict[str, Numbers]:
@@ -209,20 +187,13 @@ def _of_twists(values: Numbers) -> dict[str, Numbers]:
     }
 
 
-def _positions() -> dict[str, Numbers]:
-    def first_three(pose: Numbers) -> Numbers:
-        return lambda message: pose(message)[:3]
-
-    return {FIX: lambda _: [], **{type_: first_three(pose) for type_, pose in _POSES.items()}}
-
-
 _BY_COLUMNS: dict[tuple[str, ...], dict[str, Numbers]] = {
-    _PLACE: _positions(),
+    _PLACE: {FIX: lambda _: [], **dict.fromkeys(POSES, lambda message: pose_numbers(message)[:3])},
     ("anchor", "range_m"): {RANGE: _anchored},
     ("height_m",): {PRESSURE: _height, RANGE: lambda message: [_distance(message)]},
     ("vx_m_s", "wz_rad_s"): _of_twists(_twist),
     ("vx_m_s", "vy_m_s", "wz_rad_s"): _of_twists(_omni),
     ("left_m_s", "right_m_s"): {JOINTS: lambda _: []},
-    ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"): _POSES,
-    ("field_x_ut", "field_y_ut", "field_z_ut"): {MAGNETIC: _field},
+    ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"): dict.fromkeys(POSES, pose_numbers),
+    ("field_x_ut", "field_y_ut", "field_z_ut"): {MAGNETIC: field_ut},
 }

@@ -1,4 +1,4 @@
-"""EuRoC, TUM-VI and our own recordings: an ASL folder `mav0/{cam0,cam1,imu0,mag0,depth0}` with `data.csv` in each.
+"""EuRoC, TUM-VI and our own recordings: an ASL folder `mav0/{cam0,cam1,...,imu0,mag0,depth0}` with `data.csv` in each.
 
 The body of vislam is the IMU: when the file's body is another frame (an IMU with a `T_BS` of its own), cameras,
 magnetometer and truth are re-expressed. TUM-VI brings its calibration as Kalibr files, which are found as well.
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vislam.core.camera import Rig
+from vislam.core.camera import MOST_CAMERAS, Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
@@ -30,7 +30,6 @@ from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 LOOKS_FOR = "mav0/cam0/data.csv or mav0/imu0/data.csv"
 _TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0")  # the first gives the body itself; Leica has no attitude
 _KALIBR_FOLDERS = (".", "..", "../dso")  # seen from mav0; TUM-VI keeps them in dso
-_MAX_CAMERAS = 2
 
 
 def recognises(path: Path) -> bool:
@@ -115,10 +114,10 @@ def _imu(
 def _cameras(
     root: Path, T_body_imu: Array, problems: Problems, errors: list[DataError]
 ) -> tuple[tuple[ImageList, ...], Rig | None, tuple[float | None, ...]]:
-    """Return image lists, rig and clocks of cam0 and, if there is one, cam1, in the IMU's frame."""
+    """Return image lists, rig and clocks of cam0, cam1 and so on, as far as there are, in the IMU's frame."""
     lists: list[ImageList] = []
     found: list[CameraFile] = []
-    for index in range(_MAX_CAMERAS):
+    for index in range(MOST_CAMERAS):
         folder = root / f"cam{index}"
         if not folder.is_dir():
             break

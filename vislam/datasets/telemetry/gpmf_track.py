@@ -41,6 +41,7 @@ _AXES_BY_DEVICE = {"fusion": "yXZ"}  # whose streams are named as those of HERO5
 _USUAL_AXES = "ZXY"
 _USUAL_NAMES = ("(up/down, right/left, forward/back)", "(z,x,y)")  # in the name of a stream
 _LETTERS = "XYZ"
+_FARTHEST_S = 1e9  # from the film's beginning: thirty years
 _CLOCKS_AGREE = 0.1  # stamps that count otherwise than the MP4 by more are in another unit, or damaged
 
 
@@ -227,8 +228,8 @@ class Telemetry:
         begins_s = self._track.decoded[payloads] / self._track.timescale + self._track.shift_s
         by_count = _by_count(counted, counts, begins_s, ends_s)
         begin_s, period_s = self._by_stamps(counted, counts, by_count[1]) or by_count
-        known = zip(payloads.tolist(), begin_s.tolist(), period_s.tolist(), strict=True)
-        timed = [(index, begin, period) for index, begin, period in known if math.isfinite(begin) and period > 0.0]
+        known = zip(payloads.tolist(), begin_s.tolist(), period_s.tolist(), counts.tolist(), strict=True)
+        timed = [(i, begin, step) for i, begin, step, n in known if step > 0.0 and abs(begin) + n * step < _FARTHEST_S]
         return _Times({i: begin for i, begin, _ in timed}, {i: period for i, _, period in timed})
 
     def _by_stamps(self, counted: _Counted, counts: NDArray[np.int64], usual_s: Array) -> tuple[Array, Array] | None:

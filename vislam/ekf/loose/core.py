@@ -1,7 +1,5 @@
 """The core of the loose filter: linearise a measurement, gate, correct; and what to do if the gate keeps saying no."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -37,10 +35,9 @@ from vislam.ekf.loose.measurements import (
     where_rest_began,
     zero_velocity,
 )
-from vislam.ekf.loose.own_variables import begin, correct_by_reading
 from vislam.ekf.loose.state import Ledger, LooseState
-from vislam.ekf.regain import Watch
-from vislam.ekf.sensor_rows import Sensing
+from vislam.ekf.regain import Watch, grown
+from vislam.ekf.sensor_rows import OwnVariables, Sensing, body_of
 from vislam.ekf.stretch import Stretch
 from vislam.imu import ImuNoise
 from vislam.sensors import Suite
@@ -48,11 +45,8 @@ from vislam.sensors import Suite
 # fixed R of accumulated vision; 0.005 to 0.1 err alike, below this motions fail
 _ACCUMULATED_SIGMA_M = 0.02
 _ACCUMULATED_SIGMA_DEG = 0.5  # the gate, for the sum has drifted by more than R states
-
-
 LooseMeasurement = VoMeasurement | NewKeyframe | OnWheels
 LooseEvent = Event[LooseMeasurement]
-
 _COUNTERS = (
     "keyframes",
     "vo_accepted",
@@ -79,6 +73,55 @@ _COUNTERS = (
 )
 
 
+def begin(sensing: Sensing, state: LooseState, start: OwnStart, t_ns: int, out: Outcome) -> None:
+    """Set a sensor's own variables in a state, in place."""
+    out.accept(f"{start.sensor}_begun")
+    sensing.begin(start, state.x[kernels.NOMINAL :], state.P)
+    _note(state, start.sensor, t_ns)
+    state.ledger = replace(state.ledger, watch=state.ledger.watch.begun(start.sensor, t_ns))
+
+
+def correct_by_reading(sensing: Sensing, state: LooseState, reading: Reading, gyro_rad_s: Array, out: Outcome) -> None:
+    """Correct a state in place by a reading, unless its gate refuses it.
+
+    The past moves as well, also where `odom` is continuous: a reading may show where in `odom` the body is, and that is
+    no business of the clone.
+    """
+    name, since_ns = reading.sensor, state.ledger.own_since_ns
+    x, P = state.x.copy(), state.P.copy()  # copies: a reading that the gate refuses leaves no walk behind
+    own = OwnVariables(x[kernels.NOMINAL :], P[kernels.ERRORS :, kernels.ERRORS :], since_ns)
+    sensing.grow(name, reading.t_ns, since_ns, own.values, P)
+    rows = sensing.rows(reading, body_of(reading.t_ns, x, gyro_rad_s), own, out)
+    if rows is None:
+        return
+    m = len(rows.residual)
+    H = np.zeros((m, len(P)))
+    H[:, :15], H[:, kernels.ERRORS :][:, sensing.suite.own(name)] = rows.H, rows.H_own
+    S = H @ P @ H.T + np.eye(m)
+    everything = np.eye(len(P))
+    nis = kernels.update(x, P, H, np.eye(m), rows.residual, sensing.limit(name, m), everything)
+    watch = state.ledger.watch
+    if not sensing.judge(reading, rows, S, nis, out):
+        body = body_of(reading.t_ns, state.x, gyro_rad_s)
+        watch, regain = sensing.refuse(watch, reading, rows, body, out)
+        if regain is None:
+            state.ledger = replace(state.ledger, watch=watch)
+            return
+        sensing.regained(name, regain, out)
+        P = grown(P, regain, np.eye(15), (3, 18), body.R_world_body[2])
+        x[0:3] += regain.place_m
+        x[3:6] += regain.velocity_m_s
+        x[16:19] += regain.place_m  # the clone
+    state.x, state.P = x, P
+    _note(state, name, reading.t_ns)
+    state.ledger = replace(state.ledger, watch=watch.accepted(name, reading.t_ns, rows.H))
+
+
+def _note(state: LooseState, name: str, t_ns: int) -> None:
+    since_ns = {**state.ledger.own_since_ns, name: t_ns}
+    state.ledger = replace(state.ledger, own_since_ns=since_ns)
+
+
 class LooseCore:
     """Moves and corrects a `LooseState`, as `ekf.core.Core` has it."""
 
@@ -91,7 +134,7 @@ class LooseCore:
         own = self.sensing.suite.size
         self._config = config
         self._gravity = float(machine.gravity_m_s2)
-        self._told_sigmas = imu_sigmas(config, noise)
+        self._told_sigmas = imu_sigmas(noise)
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
         self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
         self._limits = np.array([0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)])

@@ -8,30 +8,36 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vislam.config import EkfConfig
-from vislam.core.geometry import so3_exp
+from vislam.core.chi_square import chi_square_limit
+from vislam.core.geometry import skew, so3_exp, so3_log, so3_right_jacobian
 from vislam.core.messages import Array, NavState, NoiseScale
 from vislam.core.readings import OwnStart, Reading
-from vislam.ekf.filter_core import imu_sigmas, nominal, scaled
+from vislam.ekf.filter_core import (
+    REST_SIGMA_DEG,
+    REST_SIGMA_M,
+    ZERO_RATE_SIGMA_RAD_S,
+    ZERO_VELOCITY_SIGMA_M_S,
+    imu_sigmas,
+    nominal,
+    scaled,
+)
 from vislam.ekf.history import AtRest, Event, KnownBias, Outcome
-from vislam.ekf.loose.kernels import Step
-from vislam.ekf.regain import Watch
-from vislam.ekf.sensor_rows import OwnVariables, Sensing
+from vislam.ekf.loose.kernels import Step, pose
+from vislam.ekf.regain import Regain, Watch, grown
+from vislam.ekf.sensor_rows import OwnVariables, Sensing, body_of
 from vislam.ekf.stretch import Stretch
 from vislam.ekf.tight import kernels
-from vislam.ekf.tight.kernels import INERTIAL, Inertial
-from vislam.ekf.tight.known import KnownUpdater
-from vislam.ekf.tight.own_variables import begun, corrected_by_reading
-from vislam.ekf.tight.state import CLONES, FOCAL, METRES, MOUNT, TIME, Window, propagated
+from vislam.ekf.tight.kernels import INERTIAL, Inertial, from_nav_error, to_nav_error
+from vislam.ekf.tight.state import CLONES, FOCAL, METRES, MOUNT, TIME, Rest, Window, corrected, moved, propagated
 from vislam.ekf.tight.tracks import FrameTracks
 from vislam.ekf.tight.update import FrameUpdater
 from vislam.imu import ImuNoise
-from vislam.sensors import Suite
+from vislam.sensors import BodyState, Suite
 
-if TYPE_CHECKING:  # the fast path must not load OpenCV
+if TYPE_CHECKING:
     from vislam.core.camera import Rig
 
 TightEvent = Event[FrameTracks]
-
 _MAX_OFFSET_S = 0.2  # a larger estimate is not a delay but a filter that is lost
 _COUNTERS = (
     "keyframes",
@@ -65,6 +71,156 @@ _COUNTERS = (
     "rewinds",
     "soft_resets",
 )
+_MOST_ROWS = 6  # of one measurement
+
+
+def begun(sensing: Sensing, window: Window, start: OwnStart, t_ns: int) -> tuple[Window, Outcome]:
+    """Return the window with a sensor's own variables set."""
+    out, own, P = Outcome(), window.own.copy(), window.P.copy()
+    out.accept(f"{start.sensor}_begun")
+    sensing.begin(start, own, P)
+    since_ns, watch = {**window.own_since_ns, start.sensor: t_ns}, window.watch.begun(start.sensor, t_ns)
+    return replace(window, own=own, P=P, own_since_ns=since_ns, watch=watch), out
+
+
+def corrected_by_reading(
+    sensing: Sensing, window: Window, x: Array, reading: Reading, gyro_rad_s: Array, ago_s: float
+) -> tuple[Window, Outcome]:
+    """Return the window after a reading that was taken `ago_s` before x [16], which moves in place.
+
+    `ago_s` is 0 unless a frame came between whose stamp is older, by a clock that is behind.
+    """
+    out, name = Outcome(), reading.sensor
+    body = body_of(reading.t_ns, x, gyro_rad_s)
+    P, values, at = window.P.copy(), window.own.copy(), sensing.suite.own(name)
+    sensing.grow(name, reading.t_ns, window.own_since_ns, values, P)
+    own = OwnVariables(values, P, window.own_since_ns)
+    rows = sensing.rows(reading, body if ago_s == 0.0 else body.later(-ago_s), own, out)
+    if rows is None:
+        return window, out
+    free = replace(window, own=values, P=P)
+    H = np.zeros((len(rows.residual), len(P)))
+    H[:, :INERTIAL] = rows.H @ by_now(body, ago_s) @ to_nav_error(x)
+    H[:, window.first_own :][:, at] = rows.H_own
+    S = H @ P @ H.T + np.eye(len(H))
+    nis = float(rows.residual @ np.linalg.solve(S, rows.residual))
+    since_ns = {**window.own_since_ns, name: reading.t_ns}
+    if sensing.judge(reading, rows, S, nis, out):
+        window = corrected(free, x, H, rows.residual)
+        return replace(window, own_since_ns=since_ns, watch=window.watch.accepted(name, reading.t_ns, rows.H)), out
+    watch, regain = sensing.refuse(window.watch, reading, rows, body, out)
+    if regain is None:
+        return replace(window, watch=watch), out
+    sensing.regained(name, regain, out)
+    window = _regained(free, x, body, regain)
+    return replace(window, own_since_ns=since_ns, watch=watch.accepted(name, reading.t_ns, rows.H)), out
+
+
+def _regained(window: Window, x: Array, body: BodyState, regain: Regain) -> Window:
+    """Return a window moved by what its body, clones and points are off by; x [16] moves in place.
+
+    As an invariant error has the place turned by the error of rotation in it, the covariance of that moves, too.
+    """
+    clones, points = range(CLONES, window.first_point, 6), range(window.first_point, window.first_own, 3)
+    T, by_turn = np.eye(len(window.P)), skew(regain.place_m)
+    T[3:6, 0:3], T[6:9, 0:3] = by_turn, skew(regain.velocity_m_s)
+    for at in clones:
+        T[at + 3 : at + 6, at : at + 3] = by_turn
+    for at in points:
+        T[at : at + 3, 0:3] = by_turn
+    places = (3, *(at + 3 for at in clones), *points)
+    P = T @ grown(window.P, regain, from_nav_error(x), places, body.R_world_body[2]) @ T.T
+    x[0:3] += regain.place_m
+    x[3:6] += regain.velocity_m_s
+    return replace(
+        window, P=0.5 * (P + P.T), p=window.p + regain.place_m, velocity=window.velocity + regain.velocity_m_s,
+        points=window.points + regain.place_m,
+    )  # fmt: skip
+
+
+def by_now(body: BodyState, ago_s: float) -> Array:
+    """Return how the error [15] of the body a moment ago, `body.later(-ago_s)`, hangs on that of now."""
+    M = np.eye(INERTIAL)
+    M[0:3, 0:3] = so3_exp(body.rate_rad_s * ago_s)
+    M[0:3, 9:12] = ago_s * so3_right_jacobian(-body.rate_rad_s * ago_s)
+    M[3:6, 6:9] = -ago_s * np.eye(3)
+    return M
+
+
+class KnownUpdater:
+    """Applies what is known without an image; the same on the same state gives the same answer."""
+
+    def __init__(self, config: EkfConfig, noise: ImuNoise) -> None:
+        """Take the settings, and the noise by which the gyroscope shows rest."""
+        self._limits = [chi_square_limit(config.gate_probability, max(k, 1)) for k in range(_MOST_ROWS + 1)]
+        self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
+
+    def rest(self, window: Window, x: Array, gyro_rad_s: Array, t_ns: int) -> tuple[Window, Outcome]:
+        """Use that the body is at rest: no velocity, the gyro shows its bias, the pose is that where rest began."""
+        out = Outcome()
+        R = pose(x, 0, 6)[:3, :3]
+        H = np.zeros((6, len(window.P)))
+        H[:3, 6:9] = R.T / ZERO_VELOCITY_SIGMA_M_S
+        rate_sigma = max(ZERO_RATE_SIGMA_RAD_S, self._white_rate_sigma * window.noise.gyro)
+        H[3:, 9:12] = np.eye(3) / rate_sigma
+        r = np.concatenate((-R.T @ x[3:6] / ZERO_VELOCITY_SIGMA_M_S, (gyro_rad_s - x[13:16]) / rate_sigma))
+        if not self._passes("zero_velocity", window, H, r, out):
+            return replace(window, rest=None), out
+        window = replace(corrected(window, x, H, r), rested_t_ns=t_ns, watch=window.watch.seen(t_ns))
+        stamps = [frame.t_ns for frame in window.frames]
+        if window.rest is not None and window.rest.t_ns in stamps:
+            window = self._hold(window, x, stamps.index(window.rest.t_ns), out)
+        elif t_ns in stamps:
+            R = pose(x, 0, 6)[:3, :3]
+            window = replace(window, rest=Rest(t_ns, R, np.eye(3)))
+        if window.rest is not None:
+            to_first = np.ascontiguousarray(window.rest.R @ pose(x, 0, 6)[:3, :3].T)
+            window = replace(window, rest=replace(window.rest, to_first=to_first))
+        return window, out
+
+    def _hold(self, window: Window, x: Array, index: int, out: Outcome) -> Window:
+        sigmas = np.repeat([np.deg2rad(REST_SIGMA_DEG), REST_SIGMA_M], 3)
+        T = pose(x, 0, 6)
+        H = np.zeros((6, len(window.P)))
+        at = CLONES + 6 * index
+        here = np.eye(6)
+        here[3:, :3] = -skew(window.p[index])
+        H[:, :6] = here / sigmas[:, None]
+        H[:, at : at + 6] = -here / sigmas[:, None]
+        turned = so3_log(window.R[index] @ np.ascontiguousarray(T[:3, :3].T))
+        r = np.concatenate((turned, window.p[index] - T[:3, 3])) / sigmas
+        if not self._passes("hold", window, H, r, out):
+            return replace(window, rest=None)
+        return corrected(window, x, H, r)
+
+    def _passes(self, kind: str, window: Window, H: Array, r: Array, out: Outcome) -> bool:
+        S = H @ window.P @ H.T + np.eye(len(r))
+        nis = float(r @ np.linalg.solve(S, r))
+        accepted = nis <= self._limits[len(r)]
+        out.count(f"{kind}_{'accepted' if accepted else 'gated'}")
+        if np.isnan(out.nis):
+            out.accepted, out.nis = accepted, nis
+        if accepted:
+            out.test(kind, 1, nis, len(r))
+        else:
+            out.reason = f"innovation {nis:.1f} of at most {self._limits[len(r)]:.1f}"
+        return accepted
+
+    def known_bias(self, window: Window, x: Array, bias: Array) -> tuple[Window, Outcome]:
+        """Take biases [12] (gyro, accel, their sigmas) found elsewhere; only the biases move (Schmidt-Kalman)."""
+        out = Outcome()
+        H = np.zeros((6, len(window.P)))
+        H[:, 9:15] = np.diag(1.0 / bias[6:])
+        r = np.concatenate((bias[:3] - x[13:16], bias[3:6] - x[10:13])) / bias[6:]
+        if not self._passes("bias", window, H, r, out):
+            return window, out
+        HP = H @ window.P
+        S = HP @ H.T + np.eye(6)
+        K = np.zeros((len(window.P), 6))
+        K[9:15] = np.linalg.solve(S, HP[:, 9:15]).T
+        KHP = K @ HP
+        P = window.P - KHP - KHP.T + K @ S @ K.T
+        return moved(replace(window, P=0.5 * (P + P.T)), x, K @ r), out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +270,7 @@ class TightCore:
         self.counters = (*_COUNTERS, *self.sensing.counters)
         self._config = config
         self._gravity = gravity_m_s2
-        self._told_sigmas = imu_sigmas(config, noise)
+        self._told_sigmas = imu_sigmas(noise)
         self._frames, self._known = FrameUpdater(config, gravity_m_s2, rig), KnownUpdater(config, noise)
         self._scale_sigmas = rig.cameras[0].sigmas.focal, rig.metres_sigma
         self.R_configured = np.ascontiguousarray(rig.T_body_cams[0][:3, :3], dtype=np.float64)
@@ -132,10 +288,8 @@ class TightCore:
         P = np.zeros((n, n))
         M = kernels.from_nav_error(x)
         P[:15, :15] = M @ (0.5 * (start.covariance + start.covariance.T)) @ M.T
-        if config.tight_time_offset:
-            P[TIME, TIME] = config.tight_time_offset_sigma_s**2
-        if config.tight_extrinsic_rotation:
-            P[MOUNT, MOUNT] = np.eye(3) * np.deg2rad(config.tight_extrinsic_sigma_deg) ** 2
+        P[TIME, TIME] = config.tight_time_offset_sigma_s**2
+        P[MOUNT, MOUNT] = np.eye(3) * np.deg2rad(config.tight_extrinsic_sigma_deg) ** 2
         P[FOCAL, FOCAL], P[METRES, METRES] = np.square(self._scale_sigmas)
         time_offset_s, R_body_cam = 0.0, self.R_configured
         if camera is not None:

@@ -1,9 +1,10 @@
 """Compiled arithmetic of tracks: where a point is, what its pixels say about the poses they were seen from.
 
-One observation is a row [11]: direction x, y on z = 1 and pixel from the principal point; the same four numbers for the
+One observation is a row [12]: direction x, y on z = 1 and pixel from the principal point; the same four numbers for the
 right camera; inverse depth in 1/m; seconds after the frame's time at which its row was read; its standard deviations
-over those given. NaN where not measured. Predictions go through the lens: derivatives at the pixel that was measured
-would have its noise in common with the residual, and the focal length would drift by it.
+over those given; the camera that sees. NaN where not measured: only cam0 has a right camera and depth. Predictions go
+through the lens: derivatives at the pixel that was measured would have its noise in common with the residual, and the
+focal length would drift by it.
 Residuals are whitened: left pixels; right minus left pixels (matching left to right is better than following a corner
 over time, and both share the error of the corner); inverse depth.
 """
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 
 from vislam.core.geometry import skew, so3_exp
 from vislam.core.jit import njit
-from vislam.core.lens import Lens, imaged
+from vislam.core.lens import Lenses, imaged, lens_at
 from vislam.core.messages import Array
 from vislam.core.small import by, in_a_row, minus, plus, times, turned
 
-COLUMNS = 11
+COLUMNS = 12
 CALIBRATION = 5  # errors that all observations share: rotation of the camera (3), focal length, metres
 ROWS_MAX = 5  # of one observation
 _STEPS = 10
@@ -36,11 +37,10 @@ USED, FEW, PARALLAX, RANGE, OUTLIER, GATED = 0, 1, 2, 3, 4, 5
 class Sensor(NamedTuple):
     """What the cameras measure with."""
 
-    lens: Lens  # of cam0
-    right: Lens  # of cam1; any, without one
+    lenses: Lenses  # the right camera is the second
     sigmas: Array  # [3] pixels, disparity in pixels, inverse depth in 1/m
-    R_cam1_cam0: Array  # [3, 3] rotation into the right camera
-    t_cam1_cam0: Array  # [3] origin of cam0 in the right camera
+    R_cams_cam0: Array  # [C, 3, 3] rotation from cam0 into each camera
+    t_cams_cam0: Array  # [C, 3] origin of cam0 in each
     focal: float = 1.0  # times what was given, as `metres`: the baseline or the unit of depth
     metres: float = 1.0
     spread: float = 1.0  # of whitened rows as they turn out, at most 1: outliers are judged by it
@@ -50,9 +50,9 @@ class Views(NamedTuple):
     """Observations, and where each was made from."""
 
     at: NDArray[np.int64]  # [M] clone
-    seen: Array  # [M, 11] rows as above
-    R_cam: Array  # [M, 3, 3] R_cam_world
-    centres: Array  # [M, 3] of the camera
+    seen: Array  # [M, 12] rows as above
+    R_cam: Array  # [M, 3, 3] R_cam_world of the camera that sees
+    centres: Array  # [M, 3] of the same
 
 
 class Prior(NamedTuple):
@@ -85,16 +85,17 @@ class Tracks(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def observe(y: Array, seen: Array, sensor: Sensor, r: Array, J: Array, by_lens: Array) -> int:
-    """Write the whitened residuals r [5] of a point y [3] in cam0 and derivatives of predictions; return how many.
+    """Write the whitened residuals r [5] of a point y [3] in the camera that sees, and derivatives of predictions.
 
-    By y J [5, 3], by focal length and metres `by_lens` [5, 2]. 0 rows: the point is not in front of the camera.
+    By y J [5, 3], by focal length and metres `by_lens` [5, 2]. Returns how many rows; 0: the point is not in front of
+    the camera.
     """
     if not y[2] > 1e-6:
         return 0
-    lens, right, sigmas, R_cam1_cam0, t_cam1_cam0, focal, metres, _ = sensor
+    lenses, sigmas, R_cams_cam0, t_cams_cam0, focal, metres, _ = sensor
     pixel, disparity, depth = sigmas[0] * seen[10], sigmas[1] * seen[10], sigmas[2] * seen[10]
     z = 1.0 / y[2]
-    u, v, ux, uy, vx, vy = imaged(y[0] * z, y[1] * z, lens)
+    u, v, ux, uy, vx, vy = imaged(y[0] * z, y[1] * z, lens_at(lenses, int(seen[11])))
     if not np.isfinite(u):
         return 0
     for i in range(2):
@@ -104,14 +105,14 @@ def observe(y: Array, seen: Array, sensor: Sensor, r: Array, J: Array, by_lens: 
         J[i, 0], J[i, 1], J[i, 2] = a * z, b * z, -(a * y[0] + b * y[1]) * z * z
     rows = 2
     if np.isfinite(seen[4]):
-        R1, t1 = R_cam1_cam0, metres * t_cam1_cam0
+        R1, t1 = R_cams_cam0[1], metres * t_cams_cam0[1]
         y10 = R1[0, 0] * y[0] + R1[0, 1] * y[1] + R1[0, 2] * y[2] + t1[0]
         y11 = R1[1, 0] * y[0] + R1[1, 1] * y[1] + R1[1, 2] * y[2] + t1[1]
         y12 = R1[2, 0] * y[0] + R1[2, 1] * y[1] + R1[2, 2] * y[2] + t1[2]
         if not y12 > 1e-6:
             return 0
         z1 = 1.0 / y12
-        u, v, ux, uy, vx, vy = imaged(y10 * z1, y11 * z1, right)
+        u, v, ux, uy, vx, vy = imaged(y10 * z1, y11 * z1, lens_at(lenses, 1))
         if not np.isfinite(u):
             return 0
         for i in range(2):
@@ -144,14 +145,16 @@ def camera_poses(
     p: Array,
     rate: Array,
     velocity: Array,
-    R_body_cam: Array,
-    p_body_cam: Array,
+    T_body_cam: tuple[Array, Array],
+    sensor: Sensor,
 ) -> tuple[Array, Array]:
-    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 11] made from the clones `at` [M].
+    """Return R_cam_world [M, 3, 3] and camera centres [M, 3] of observations [M, 12] made from the clones `at` [M].
 
-    Clones: R [C, 3, 3], p [C, 3], body rate [C, 3], world velocity [C, 3]; the last two carry the pose to the time at
-    which a rolling shutter read the row.
+    The body has cam0 at T_body_cam, rotation [3, 3] and place [3], and the other cameras sit on that one. Clones: R
+    [C, 3, 3], p [C, 3], body rate [C, 3], world velocity [C, 3]; the last two carry the pose to the time at which a
+    rolling shutter read the row.
     """
+    R_body_cam, p_body_cam = T_body_cam
     out_R = np.empty((len(at), 3, 3))
     out_c = np.empty((len(at), 3))
     for m in range(len(at)):
@@ -160,8 +163,13 @@ def camera_poses(
         if seen[m, 9] != 0.0:
             R_world_body = R_world_body @ so3_exp(rate[i] * seen[m, 9])
             centre = centre + velocity[i] * seen[m, 9]
+        camera = int(seen[m, 11])
         out_c[m] = centre + R_world_body @ p_body_cam
         out_R[m] = (R_world_body @ R_body_cam).T
+        if camera > 0:
+            R_cam_world = sensor.R_cams_cam0[camera] @ out_R[m]
+            out_c[m] -= R_cam_world.T @ sensor.t_cams_cam0[camera]
+            out_R[m] = R_cam_world
     return out_R, out_c
 
 
@@ -221,7 +229,8 @@ def _first_rho(views: Views, sensor: Sensor) -> float:
         weight += float(w @ w)
         if np.isfinite(seen[m, 4]):
             d = np.array([seen[m, 4], seen[m, 5], 1.0])
-            u, w = np.cross(d, sensor.R_cam1_cam0 @ a), np.cross(d, sensor.R_cam1_cam0 @ b + sensor.t_cam1_cam0)
+            R1, t1 = sensor.R_cams_cam0[1], sensor.t_cams_cam0[1]
+            u, w = np.cross(d, R1 @ a), np.cross(d, R1 @ b + t1)
             total -= float(u @ w)
             weight += float(w @ w)
     rho = total / weight if weight > 1e-12 else 0.2
@@ -265,6 +274,15 @@ def _normal(state: Array, views: Views, R_a: Array, sensor: Sensor, r: Array, J:
 
 
 @njit(cache=True, nogil=True)
+def turned_with_cam0(J: Array, y: Array, camera: int, sensor: Sensor) -> Array:
+    """Return derivatives [n, 3] by a turn of cam0 (camera side), on which all cameras sit; J [n, 3] is that by y."""
+    if camera == 0:
+        return J @ skew(y)
+    R = sensor.R_cams_cam0[camera]
+    return (J @ R) @ skew(R.T @ (y - sensor.t_cams_cam0[camera]))
+
+
+@njit(cache=True, nogil=True)
 def linearise(point: Array, views: Views, sensor: Sensor, clones: int) -> tuple[Array, Array, int]:
     """Return A [rows, 5 + 6 C + 1] and H_f [rows, 3] of one point, and the rows; 0: it is behind a camera.
 
@@ -286,7 +304,7 @@ def linearise(point: Array, views: Views, sensor: Sensor, clones: int) -> tuple[
             return A, H_f, 0
         by_point = J[:rows] @ R_cam[m]
         by_turn = by_point @ S
-        by_mount = J[:rows] @ skew(y)
+        by_mount = turned_with_cam0(J[:rows], y, int(seen[m, 11]), sensor)
         first = CALIBRATION + 6 * at[m]
         for i in range(rows):
             A[n + i, 3], A[n + i, 4] = by_lens[i, 0], by_lens[i, 1]

@@ -44,7 +44,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
             config: see `EkfConfig`.
             noise: of the IMU, until `follow_noise` gives what the samples show.
             machine: gravity is down in `odom`.
-            rig: cameras; observations may also hold right pixels (two cameras) or depth.
+            rig: cameras; observations may also hold right pixels (a pair), depth, and tracks of further cameras.
             suite: sensors other than IMU and camera; None: there are none.
         """
         self._rig = rig
@@ -104,7 +104,7 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
         when they end or have been followed through the whole window. No new point is kept in the state while the motion
         does not show scale.
         """
-        if not vo.tracking.sees:
+        if not vo.tracking.sees and not observations.further:
             return self._refuse("vision_lost", "tracking lost")
         if self._history is not None and self._history.holds(vo.t_ns, FrameTracks):
             return self._refuse("vision_duplicate", f"a frame of {vo.t_ns} ns is here already")

@@ -22,7 +22,7 @@ class FrameTracks:
     t_ns: int  # stamp of the frame
     ids: NDArray[np.int64]  # [N] ascending
     pixels_px: Array  # [N, 2]
-    seen: Array  # [N, 11] rows of `features`
+    seen: Array  # [N, 12] rows of `features`
     unused: NDArray[np.bool_]  # [N] each observation is used once
     shows_scale: bool = True  # False: the motion before it was too uniform for one camera to see how large things are
 
@@ -40,24 +40,40 @@ class Ripe:
 
 def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float, shows_scale: bool = True) -> FrameTracks:
     """Return the usable observations of a frame: finite, one per track, with a ray in the camera model."""
-    ids, first = np.unique(np.asarray(observations.track_ids, dtype=np.int64), return_index=True)
     at_once = observations.instant_px is not None
     given = observations.instant_px if observations.instant_px is not None else observations.pixels_px
-    pixels = np.asarray(given, dtype=np.float64).reshape(-1, 2)[first]
-    seen = np.full((len(ids), COLUMNS), np.nan)
-    camera = rig.cameras[0]
-    seen[:, :4] = _rays(camera, pixels)
+    ids, pixels, seen, first = _seen_by(0, rig, observations.track_ids, given, 0.0 if at_once else readout_s)
     if observations.right_px is not None and rig.is_stereo:
         seen[:, 4:8] = _rays(rig.cameras[1], np.asarray(observations.right_px, dtype=np.float64)[first])
     if observations.depth_m is not None:
         depth = np.asarray(observations.depth_m, dtype=np.float64)[first]
         good = np.isfinite(depth) & (depth > 0.0)
         seen[good, 8] = 1.0 / depth[good]
-    rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
-    seen[:, 9] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * (0.0 if at_once else readout_s)
+    if observations.further:
+        others = [_seen_by(o.camera, rig, o.track_ids, o.pixels_px, readout_s)[:3] for o in observations.further]
+        ids, pixels, seen = (np.concatenate(parts) for parts in zip((ids, pixels, seen), *others, strict=True))
+        order = np.argsort(ids, kind="stable")
+        ids, pixels, seen = ids[order], pixels[order], seen[order]
     seen[:, 10] = observations.noise
     fit = np.isfinite(seen[:, :4]).all(axis=1) & np.isfinite(seen[:, 9])
     return FrameTracks(t_ns, ids[fit], pixels[fit], seen[fit], np.ones(int(fit.sum()), dtype=np.bool_), shows_scale)
+
+
+def _seen_by(
+    number: int, rig: Rig, track_ids: NDArray[np.int64], pixels_px: Array, readout_s: float
+) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64]]:
+    """Return ids [N] of a camera's tracks, ascending, pixels [N, 2] and rows [N, 12] without noise, and where each was.
+
+    Of tracks that come twice the first is taken.
+    """
+    ids, first = np.unique(np.asarray(track_ids, dtype=np.int64), return_index=True)
+    pixels = np.asarray(pixels_px, dtype=np.float64).reshape(-1, 2)[first]
+    camera, seen = rig.cameras[number], np.full((len(ids), COLUMNS), np.nan)
+    seen[:, :4] = _rays(camera, pixels)
+    rows = np.clip(pixels[:, 1], 0.0, camera.height - 1.0)
+    seen[:, 9] = (rows / max(camera.height - 1.0, 1.0) - 0.5) * readout_s
+    seen[:, 11] = number
+    return ids, pixels, seen, first
 
 
 def _rays(camera: Camera, pixels: Array) -> Array:
@@ -95,7 +111,7 @@ def ripe_tracks(frames: tuple[FrameTracks, ...], leaving: int | None, least: int
 
 
 def seen_at(frames: tuple[FrameTracks, ...], at: NDArray[np.int64], row: NDArray[np.int64]) -> Array:
-    """Return rows [M, 11] of `features`, each of the frame `at` [M] and the row within it."""
+    """Return rows [M, 12] of `features`, each of the frame `at` [M] and the row within it."""
     begins = np.cumsum([0, *(len(frame.ids) for frame in frames[:-1])])
     return np.asarray(np.concatenate([frame.seen for frame in frames])[begins[at] + row])
 

@@ -102,10 +102,10 @@ class FrameUpdater:
         self._config = config
         self._gravity = gravity_m_s2
         self._p_body_cam = np.ascontiguousarray(rig.T_body_cams[0][:3, 3], dtype=np.float64)
-        T_cam1_cam0 = invert(rig.T_cam0_cam1) if rig.is_stereo else np.eye(4)
+        T_cams_cam0 = np.array([invert(T) for T in rig.T_cam0_cams])
         sigmas = np.array([config.tight_pixel_sigma_px, _STEREO_SIGMA_PX, _DEPTH_SIGMA_RHO])
-        into_right = np.ascontiguousarray(T_cam1_cam0[:3, :3]), np.ascontiguousarray(T_cam1_cam0[:3, 3])
-        self._sensor = features.Sensor(*rig.lenses, sigmas, *into_right)
+        into_each = np.ascontiguousarray(T_cams_cam0[:, :3, :3]), np.ascontiguousarray(T_cams_cam0[:, :3, 3])
+        self._sensor = features.Sensor(rig.lenses, sigmas, *into_each)
         self._point_sensor = self._sensor._replace(sigmas=sigmas * np.array([config.tight_point_inflation, 1.0, 1.0]))
         self._bounds = features.Bounds(
             min_rho=1.0 / _MAX_RANGE_M,
@@ -282,8 +282,8 @@ class FrameUpdater:
             window.p,
             window.rate,
             window.velocity,
-            np.ascontiguousarray(window.R_body_cam),
-            self._p_body_cam,
+            (np.ascontiguousarray(window.R_body_cam), self._p_body_cam),
+            self._sensor,
         )
         return features.Views(at, seen, R_cam, centres)
 
@@ -376,7 +376,7 @@ def _point_rows(
         by_turn = by_point @ skew(f)
         h = np.zeros((rows, 17))
         h[:, 0:3] = -by_turn
-        h[:, 3:6] = J[:rows] @ skew(y)
+        h[:, 3:6] = features.turned_with_cam0(J[:rows], y, int(seen[k, 11]), sensor)
         h[:, 6:9] = by_turn
         h[:, 9:12] = -by_point
         h[:, 12:15] = by_point

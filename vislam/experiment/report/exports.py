@@ -1,12 +1,9 @@
 """The results as files for other programs: CSV for every number, LaTeX (booktabs) for the paper."""
 
-from __future__ import annotations
-
-import csv
 import math
 from collections.abc import Sequence
-from io import StringIO
 
+from vislam.core.files import csv_text
 from vislam.experiment.plan import Plan
 from vislam.experiment.statistics import Comparison, Group, Spread, Variant
 from vislam.experiment.trials import BY_NAME, CAUSAL, METRICS, Metric, Trial
@@ -53,7 +50,7 @@ def runs_csv(plan: Plan, trials: Sequence[Trial]) -> str:
         ]
         for t in trials
     ]  # fmt: skip
-    return _csv(head, rows)
+    return csv_text(head, rows)
 
 
 def summary_csv(plan: Plan, groups: Sequence[Group]) -> str:
@@ -68,7 +65,7 @@ def summary_csv(plan: Plan, groups: Sequence[Group]) -> str:
             found = group.spread(metric.name)
             row += ["", "", ""] if found is None else [found.median, found.low, found.high]
         rows.append(row)
-    return _csv(head, rows)
+    return csv_text(head, rows)
 
 
 def tests_csv(comparisons: Sequence[Comparison]) -> str:
@@ -85,7 +82,7 @@ def tests_csv(comparisons: Sequence[Comparison]) -> str:
         "p",
         "p_holm",
     ]
-    return _csv(
+    return csv_text(
         head,
         [
             [c.metric, c.first, c.second, c.pairs, c.first_better, c.second_better, c.ratio, c.effect, c.p, c.p_holm]
@@ -97,7 +94,7 @@ def tests_csv(comparisons: Sequence[Comparison]) -> str:
 def winners_csv(plan: Plan, winners: Sequence[Winner]) -> str:
     """Return who wins by how much, over the plan (no sequence) and on each sequence; no estimate where none does."""
     head = ["metric", "kind", "sequence", *plan.axis_names, "winner", "margin", "runner_up", "reason"]
-    return _csv(
+    return csv_text(
         head,
         [
             [w.metric, w.kind, w.sequence, *_varied(plan, w.variant), w.estimate,
@@ -161,11 +158,3 @@ def _varied(plan: Plan, variant: Variant) -> list[object]:
     """Return the value of everything that is varied; empty where it is not."""
     values: dict[str, object] = dict(variant)
     return [values.get(name, "") for name in plan.axis_names]
-
-
-def _csv(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return text.getvalue()

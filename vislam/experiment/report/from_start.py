@@ -1,7 +1,5 @@
 """Estimates from a common first pose: where each leaves the truth, by axis. A colour is an estimate of the plan."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The comparison as one HTML file that needs no network."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -17,6 +15,7 @@ from vislam.runs.report.html import (
     Cell,
     bullets,
     card,
+    drawn,
     escape,
     folded,
     note,
@@ -38,6 +37,7 @@ _COST = (
     "injected_kept",
 )  # fmt: skip
 _STATES = ("anees_position", "anees_rotation", "anees_velocity")
+_COLUMNS = 5  # of one table: a page has room for no more
 _MAX_FAILURES = 200  # shown; runs.csv holds all
 _MEASURED = (
     "Causal trajectories hold each pose as it was known when its frame had been processed; final ones know the whole "
@@ -146,16 +146,18 @@ def _failed(group: Group) -> Cell:
 
 
 def _cost(groups: Sequence[Group]) -> str:
-    metrics = [BY_NAME[name] for name in _COST]
-    seen: set[tuple[Any, ...]] = set()
-    rows: list[list[str | Cell]] = []
+    """Return tables of what estimators cost, of as many columns each as a page has room for."""
+    runs: dict[tuple[Any, ...], Group] = {}
     for group in groups:
-        if (key := (group.sequence, group.variant, group.estimator)) in seen:
-            continue  # all outputs of an estimator come from one run
-        seen.add(key)
-        cells = [shown_spread(group.spread(metric.name), metric) for metric in metrics]
-        rows.append([group.sequence, variant_text(group.variant), group.estimator, *cells])
-    return table(["sequence", "condition", "estimator", *(m.title for m in metrics)], rows, (0, 1, 2))
+        runs.setdefault((group.sequence, group.variant, group.estimator), group)  # all outputs come from one run
+    tables = []
+    for k in range(0, len(_COST), _COLUMNS):
+        metrics, rows = [BY_NAME[name] for name in _COST[k : k + _COLUMNS]], list[list[str | Cell]]()
+        for group in runs.values():
+            cells = [shown_spread(group.spread(metric.name), metric) for metric in metrics]
+            rows.append([group.sequence, variant_text(group.variant), group.estimator, *cells])
+        tables.append(table(["sequence", "condition", "estimator", *(m.title for m in metrics)], rows, (0, 1, 2)))
+    return "".join(tables)
 
 
 def _consistency(groups: Sequence[Group]) -> str:
@@ -256,7 +258,7 @@ def _failures(trials: Sequence[Trial]) -> str:
 
 
 def _picture(picture: str, title: str = "") -> str:
-    return card(picture, title=title) if picture else ""
+    return card(drawn(picture), title=title) if picture else ""
 
 
 def _manifest_text(manifest: dict[str, Any]) -> str:

@@ -1,7 +1,5 @@
 """The pictures of a comparison: colour separates filter and graph, marker and line style the estimators."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 Motions [3] are theta, x and y of the level frame.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

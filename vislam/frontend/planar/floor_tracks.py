@@ -1,7 +1,5 @@
 """Tracks of a keyframe on the floor and off it: where they were first seen, and what is known of their depth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

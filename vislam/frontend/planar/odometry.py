@@ -10,8 +10,6 @@ Method `split` is that of Karpov 2026: Harris corners in regions, rotation from 
 below it at the calibrated tilt, a base frame a few frames old, and new corners as soon as a region runs dry.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Where a frame is on the floor: how sure that is, and whether it can be believed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

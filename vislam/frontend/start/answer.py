@@ -1,7 +1,5 @@
 """What the search for the first state answers, and how a solved window becomes a state in `odom`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

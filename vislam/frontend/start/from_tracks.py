@@ -1,7 +1,5 @@
 """A start in motion of one camera: attempts from tracks and inertial data, of which one has to confirm another."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ Shen, "Robust initialization of monocular visual-inertial estimation", IROS 2017
 of scales, so that metric motion, directions and pure rotations enter the same system.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Fed with one entry per frame, it answers "waiting" and why until it is sure; a w
 a second.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import StrEnum
 
@@ -102,11 +100,7 @@ class Initialiser:
         return 0 if self._by_tracks is None else self._by_tracks.taken_back
 
     def add(
-        self,
-        span: ImuSpan | None,
-        vo: VoMeasurement,
-        at_rest_by_image: bool,
-        observations: Observations | None = None,
+        self, span: ImuSpan | None, vo: VoMeasurement, at_rest_by_image: bool, observations: Observations | None = None
     ) -> Initialisation:
         """Take one frame and answer.
 
@@ -233,15 +227,12 @@ class Initialiser:
             return refusal
         solution = from_alignment(tuple(entry.t_ns for entry in chosen), refine(window, linear))
         refusal = refusals.quality(solution, "move with more acceleration, or turn")
-        return refusal or moving(
-            chosen[0].T_vo_body, solution, metric=True, excitation_m_s2=excitation(window)
-        )  # fmt: skip
+        return refusal or moving(chosen[0].T_vo_body, solution, metric=True, excitation_m_s2=excitation(window))
 
     def _from_tracks(self) -> Initialisation:
         """Structure from motion with inertial data: scale is unknown to the camera."""
         if self._by_tracks is None:
-            reason = "without scale a moving start needs the camera's calibration"
-            return self._refusals.refuse("calibration", reason)
+            return self._refusals.refuse("calibration", "without scale a moving start needs the camera's calibration")
         chosen = self._window.choose_nodes(_NODE_SPACING_S, _MONO_MAX_NODES)
         window = self._inertial_window(chosen, [])
         return self._by_tracks.solve(Sighted(chosen, window, self._window.seen_s, self.time_offset_sigma_s))

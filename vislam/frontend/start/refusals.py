@@ -1,7 +1,5 @@
 """Why a window gives no first state: what it lacks, or what contradicts physics; counted by cause."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.config import InitConfig

@@ -1,7 +1,5 @@
 """The last frames that an initialisation looks at, and what is cut out of them for a solver."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -12,7 +12,7 @@ Work comes in small steps (generators), so that a live run can spread it over ke
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -90,6 +90,13 @@ class Consensus:
             self._fresh += 1
             self._doubts += in_doubt
             self._doubted |= in_doubt
+
+    def without(self, gone: Collection[int], held: Callable[[int], bool], travel: Travel) -> Consensus:
+        """Return another that was offered all the loops of this one but those that are gone; `held` as for `step`."""
+        other = Consensus(self._config)
+        for loop in (m for loops in self._witnesses.loops() for m in loops if m.id not in gone):
+            other.offer(loop, not held(loop.id), travel)
+        return other
 
     @property
     def is_due(self) -> bool:

@@ -6,9 +6,7 @@ Odometry covariances are optimistic, so a true loop can lie outside the gate, an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
-import numpy as np
+from collections.abc import Sequence
 
 from vislam.config import GraphConfig
 from vislam.core.memory import EdgeReport
@@ -21,9 +19,6 @@ from vislam.graph.belief.known import Known
 from vislam.graph.belief.reports import LoopReports
 from vislam.graph.estimator import Estimator
 from vislam.graph.travel import Travel
-
-_ALIKE = 0.1  # of their length, by which steps that are the same may differ
-_NO_CHANCE = 3  # of them
 
 
 class Gate:
@@ -90,20 +85,3 @@ class PendingLoops:
         """Take edges out, those of them that are here."""
         gone = {edge.id for edge in edges}
         self._edges = [edge for edge in self._edges if edge.id not in gone]
-
-    def repeats_m(self, ends: Callable[[LoopModel], tuple[Array, Array]]) -> float:
-        """Return how far a place is from the next one that looks like it, by loops that miss all alike; inf: none do.
-
-        Three that are off by the same motion are no chance: there is a second wall of the same panels. `ends` gives the
-        poses [4, 4] of the keyframes of a loop.
-        """
-        steps = []
-        for edge in self._edges:
-            if edge.record.has_scale:
-                T_from, T_to = ends(edge)
-                step = T_to[:3, :3] @ edge.residual(T_from, T_to)[0][3:]
-                steps.append(step if step[np.argmax(np.abs(step))] > 0.0 else -step)
-        off = np.array(steps).reshape(-1, 3)
-        length_m = np.linalg.norm(off, axis=1)
-        alike = np.linalg.norm(off[:, None] - off[None], axis=2) < _ALIKE * length_m
-        return float(min(length_m[alike.sum(axis=1) >= _NO_CHANCE], default=np.inf))

@@ -11,6 +11,7 @@ from vislam.graph.estimator import Estimator
 
 _LOOP_BATCH_M = 1.0  # a larger correction starts from a batch solution instead of incremental steps
 _LOOP_BATCH_DEG = 10.0
+_FITS = 0.1  # weight
 _DOUBTS = 100  # loops that are looked at again when a review is due
 
 
@@ -45,6 +46,10 @@ class HeldLoops:
     def weight(self, loop: LoopModel) -> float:
         """Return the weight, 0 to 1, that the Cauchy kernel leaves a loop."""
         return loop.weight(*self.ends(loop))
+
+    def fits(self, loop: LoopModel) -> bool:
+        """Return whether one step under the kernel brings a loop in; what is left follows with the next keyframes."""
+        return self.weight(loop) >= _FITS
 
     def is_torn(self, loop: LoopModel) -> bool:
         """Return whether the graph contradicts a loop that is in it."""

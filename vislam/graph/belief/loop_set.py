@@ -12,6 +12,7 @@ from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.belief.anchors import Anchors
 from vislam.graph.belief.consensus import Consensus, Verdict
+from vislam.graph.belief.exchange import Exchange
 from vislam.graph.belief.freezer import Freezer
 from vislam.graph.belief.gate import Gate, PendingLoops
 from vislam.graph.belief.held import HeldLoops
@@ -21,7 +22,6 @@ from vislam.graph.estimator import Estimator
 from vislam.graph.travel import Travel
 
 _VO_SCALE_MAX = 10.0  # most that loops may inflate the sigma of visual odometry, over a run
-_FITS = 0.1  # weight above which one step under the kernel does, and what is left follows with the next keyframes
 
 
 class LoopSet:
@@ -42,18 +42,16 @@ class LoopSet:
         self.gate = Gate(estimator, travel, self._held, self.ledger)
         self._pending = PendingLoops(config)
         self._anchors = Anchors(config, estimator)
+        self._exchange = Exchange(estimator, self._held, self.gate, self._anchors, self.ledger)
         self._consensus = Consensus(config)
         self._beyond_help: set[int] = set()  # loops that a review brought in and the graph contradicted
         self.freezer = Freezer(config, estimator, self._held)
+        self._undone: set[int] = set()  # loops that the user took out
 
     @property
     def pending(self) -> int:
         """Return how many loops are pending."""
         return len(self._pending.edges)
-
-    def repeats_m(self) -> float:
-        """Return how far a place is from the next one that is known to look like it, see PendingLoops."""
-        return self._pending.repeats_m(self._held.ends)
 
     @property
     def held(self) -> list[LoopModel]:
@@ -69,6 +67,7 @@ class LoopSet:
         """Return where the loops are now that were decided about since the last call; some wait elsewhere."""
         apart = {model.record.id: LoopPlace.PENDING for model in self._pending.edges}
         apart |= {model.record.id: LoopPlace.WAITING for model in waiting}
+        apart |= dict.fromkeys(self._undone, LoopPlace.UNDONE)
         return tuple(self._loop_state(n, apart) for n in self.ledger.take_changed())
 
     def take_ties(self) -> tuple[Tied, ...]:
@@ -88,6 +87,7 @@ class LoopSet:
             self._anchors.tie(tied)
         for model in by_place[LoopPlace.PENDING]:
             self._pending.add(model)
+        self._undone = {model.id for model in by_place[LoopPlace.UNDONE]}
         apart = {model.id for place in (LoopPlace.WAITING, LoopPlace.UNDONE) for model in by_place[place]}
         for model in (m for m in models if m.id not in apart):
             self._consensus.offer(model, model.id not in self._held, self._travel)
@@ -122,6 +122,18 @@ class LoopSet:
         for model in gone:
             self.ledger.add(model, LoopDecision.REJECTED, "left the full list of pending loops")
         return [model.record.id for model in gone]
+
+    def undo(self, loop_ids: Sequence[int], notes: list[str]) -> list[int]:
+        """Take loops out for good, as far as the graph holds them; return the ids of those."""
+        out = [m for m in self.held if m.id in loop_ids]
+        for model in out:
+            self._estimator.spare.pop(model.id, None)
+            self.ledger.add(model, LoopDecision.REJECTED, "undone by the user")
+        if out:
+            self._undone |= {m.id for m in out}
+            self._exchange.rebuild(out, [], notes)
+            self._consensus = self._consensus.without(self._undone, self._held.__contains__, self._travel)
+        return [m.id for m in out]
 
     def review(self, notes: list[str]) -> list[int]:
         """Let the review of all loops work for a while; return the ids about which it decided."""
@@ -177,7 +189,7 @@ class LoopSet:
         if not fresh:
             return []
         far = any(self._held.is_far(m) for m in fresh)
-        fits = not far and all(self._held.weight(m) >= _FITS for m in fresh)
+        fits = not far and all(self._held.fits(m) for m in fresh)
         notes.append(self._estimator.close(fresh, batch=far, gentle=fits and self._held.are_many))
         contradicted = self._judge(fresh, reason)
         if contradicted:
@@ -228,47 +240,10 @@ class LoopSet:
             estimator.distrust_odometry(verdict.scale)
             self._travel.scale(verdict.scale)
         self._pending.remove(back)
-        if out or verdict.scale > 1.0 or not self._let_in(back, notes):
-            self._rebuild(out, back, notes)
+        if out or verdict.scale > 1.0 or not self._exchange.let_in(back, notes):
+            self._exchange.rebuild(out, back, notes)
         torn = self._judge(back, f"let in at keyframe {newest}: it agrees with {verdict.places} places", True)
         self._beyond_help |= {m.id for m in torn}
         if torn:
             notes.append(estimator.drop(torn))
         return [m.id for m in (*out, *back)]
-
-    def _let_in(self, back: list[LoopModel], notes: list[str]) -> bool:
-        """Put loops that fit into a solver that old keyframes have left; return False, and do nothing, where none has.
-
-        What ends with a keyframe that left is kept in spare.
-        """
-        estimator = self._estimator
-        if not estimator.summed_up.firsts or any(self._held.weight(m) < _FITS for m in back):
-            return False
-        known = self.gate.known(back, self._anchors) if back else None
-        if known is None:
-            return not back
-        late = [m for m in back if estimator.summed_up.host(m.record.to_id) != m.record.to_id]
-        fresh = [m for m in back if m not in late]
-        for model in fresh:
-            self._anchors.tie_to_host(model, known)
-        estimator.spare |= {model.id: model for model in late}
-        notes.append(estimator.close(fresh, batch=False) if fresh else "")
-        return True
-
-    def _rebuild(self, out: list[LoopModel], back: list[LoopModel], notes: list[str]) -> None:
-        """Take loops out of the graph and others into it.
-
-        Where one is out, places may have been tied together that are not the same: all loops are as measured again.
-        """
-        estimator = self._estimator
-        tied = [m for m in (*estimator.loops.values(), *back) if m.tie is not None]
-        for model in tied if out or back else []:
-            model.tie = None
-            self.ledger.touch(model.id)
-        if out:
-            self._anchors.forget()
-        held = [m for m in out if m.id in estimator.loops]
-        if back or (held and tied):
-            notes.append(estimator.revise(held, back))
-        elif held:
-            notes.append(estimator.drop(held))

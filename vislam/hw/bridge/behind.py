@@ -1,7 +1,5 @@
 """The chips behind a serial bridge: which they are, what their counts mean, how old these are when they are read."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.config import SerialConfig

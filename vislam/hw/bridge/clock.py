@@ -5,8 +5,6 @@ close to them as possible (Moon, Skelly and Towsley, "Estimation and removal of 
 measurements", INFOCOM 1999). Delays of a busy host then do not move the stamps.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """How many frames are missing between two that came over the serial bridge."""
 
-from __future__ import annotations
-
 from vislam.hw.bridge.protocol import Hello, RawSample
 
 _SEQUENCES, _WRAP_US = 2**16, 2**32

@@ -4,8 +4,6 @@ The process that reads the bridge publishes the pose and never waits: what the o
 and counted.
 """
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections import Counter

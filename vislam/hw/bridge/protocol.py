@@ -7,8 +7,6 @@ each: a host which does not know them misses nothing. The CRC is CCITT's with in
 The structs, flags and values below are the whole table; firmware/vislam_bridge/vislam_bridge.ino is the other end.
 """
 
-from __future__ import annotations
-
 import binascii
 import struct
 from dataclasses import dataclass

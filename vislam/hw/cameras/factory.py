@@ -1,7 +1,5 @@
 """What a depth camera's maker measured: the calibration in the device, and where it sits on the body."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

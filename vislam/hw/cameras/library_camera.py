@@ -1,27 +1,40 @@
-"""A camera behind its maker's library: a thread that opens, captures and opens again, and the newest shot only."""
-
-from __future__ import annotations
+"""A camera behind a library: a thread that opens, captures and opens again, and the newest shot only."""
 
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from vislam.config import LibraryCameraConfig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Frame
 from vislam.hw.cameras.mailbox import Mailbox
-from vislam.hw.cameras.webcam import Setting
 from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
 
 _NS = 1_000_000_000
-_JOIN_S = 3.0  # a library ends a stream in about a second
+_JOIN_S = 3.0  # a library ends a stream in about a second; a driver may hold a thread for 10, and is left to it
 
 Shot = TypeVar("Shot", CapturedImage, Frame)
 Shot_co = TypeVar("Shot_co", CapturedImage, Frame, covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What was asked of the camera and what it reports to do; None: it does not offer it."""
+
+    name: str
+    asked: float | str
+    got: float | str | None
+
+    @property
+    def differs(self) -> bool:
+        """Whether the camera does something else."""
+        if isinstance(self.asked, float) and isinstance(self.got, float):
+            return abs(self.got - self.asked) > 0.02 * abs(self.asked)
+        return self.asked != self.got
 
 
 class Stream(Protocol[Shot_co]):
@@ -43,7 +56,7 @@ class Stream(Protocol[Shot_co]):
         ...
 
     def next(self) -> Shot_co | None:
-        """Return the next shot; None where one came that cannot be stamped yet.
+        """Return the next shot; None where one came that cannot be used, or stamped yet.
 
         Raises HardwareError, or what the library raises, when the camera went away or gives nothing for a second.
         """
@@ -126,10 +139,10 @@ class LibraryCamera(Generic[Shot]):
                 stream = self._open_stream()
             except Exception as error:  # such libraries raise whatever they like, and the thread must not die
                 self._failed("open_failures", error)
+                self._has_tried.set()
             else:
                 self._counts["opened"] += 1
                 self._capture(stream)
-            self._has_tried.set()
             self._is_stopping.wait(self._config.reopen_s)
 
     def _capture(self, stream: Stream[Shot]) -> None:

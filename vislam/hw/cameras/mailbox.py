@@ -1,7 +1,5 @@
 """A slot for the newest image: what is not taken in time is replaced, and counted."""
 
-from __future__ import annotations
-
 import threading
 from typing import Generic, TypeVar
 

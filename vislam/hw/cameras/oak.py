@@ -1,7 +1,5 @@
 """OAK cameras (OAK-D and its like) through depthai 3: the stereo pair or colour with depth, and their IMU."""
 
-from __future__ import annotations
-
 from datetime import timedelta
 from typing import Any
 
@@ -12,10 +10,9 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, HardwareError, install_line
 from vislam.core.messages import Array, Frame
 from vislam.hw.cameras.factory import factory_camera, grey, mounted, mounted_on_imu, rigid
-from vislam.hw.cameras.library_camera import LibraryCamera, named
+from vislam.hw.cameras.library_camera import Setting, named
 from vislam.hw.cameras.oak_imu import CM, OakClock, OakMotion, imu_pose, in_ns
 from vislam.hw.cameras.video import MAX_AGE_S
-from vislam.hw.cameras.webcam import Setting
 from vislam.hw.own_imu import OwnImu
 
 _NEXT = timedelta(seconds=1)  # without an image for this long, the device is opened again
@@ -114,18 +111,6 @@ class OakStream:
         self.stamped_by = "arrival"
         self.bad_stamps += 1
         return self._clock.arrival_ns()
-
-
-def open_oak(
-    config: OakConfig, must_be_there: bool = True, with_depth: bool = False, imu: OwnImu | None = None
-) -> LibraryCamera[Frame]:
-    """Open an OAK camera; samples of its IMU go to `imu`, where that is given.
-
-    Raises HardwareError when depthai is not installed or, where it must be there, the device is missing.
-    """
-    depthai()
-    name = "oak,depth" if with_depth else "oak"
-    return LibraryCamera(name, lambda: OakStream(config, with_depth, imu), config, must_be_there)
 
 
 def oak_rig(config: OakConfig, with_depth: bool = False, with_imu: bool = False) -> tuple[Rig, bool]:

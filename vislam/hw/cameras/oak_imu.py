@@ -1,7 +1,5 @@
 """The IMU of an OAK, and the clock that it shares with the images: depthai's, put on the host's."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The Raspberry Pi's own camera through picamera2: stamps of the sensor, moved to the middle of the exposure."""
 
-from __future__ import annotations
-
 import time
 from contextlib import closing, suppress
 from typing import Any
@@ -10,9 +8,8 @@ import numpy as np
 
 from vislam.config import PicamConfig
 from vislam.core.errors import HardwareError, install_line
-from vislam.hw.cameras.library_camera import LibraryCamera
+from vislam.hw.cameras.library_camera import Setting
 from vislam.hw.cameras.video import MAX_AGE_S
-from vislam.hw.cameras.webcam import Setting
 from vislam.hw.source import CapturedImage
 
 _NS = 1_000_000_000
@@ -112,15 +109,6 @@ class PicamStream:
         self.stamped_by = f"the sensor's first line{clock}{middle}"
         self._age_ns = max(age_ns, 0) + exposure_ns // 2
         return arrival_ns - self._age_ns
-
-
-def open_picam(config: PicamConfig, must_be_there: bool = True) -> LibraryCamera[CapturedImage]:
-    """Open a camera of the Raspberry Pi.
-
-    Raises HardwareError when picamera2 is not installed or, where it must be there, the camera is missing.
-    """
-    picamera2()
-    return LibraryCamera(f"picam:{camera_number(config)}", lambda: PicamStream(config), config, must_be_there)
 
 
 def picamera2() -> Any:

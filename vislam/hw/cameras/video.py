@@ -1,7 +1,5 @@
 """A video file in the place of a webcam, in real time by its own stamps or as fast as it is read."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -1,13 +1,9 @@
 """A webcam through OpenCV and V4L2: settings that stay, capture stamps of the driver, the newest image only."""
 
-from __future__ import annotations
-
 import os
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,9 +12,8 @@ import cv2
 from vislam.config import BridgeClockConfig, WebcamConfig
 from vislam.core.errors import HardwareError
 from vislam.hw.bridge.clock import DeviceClock
-from vislam.hw.cameras.mailbox import Mailbox
+from vislam.hw.cameras.library_camera import LibraryCamera, Setting
 from vislam.hw.cameras.video import MAX_AGE_S
-from vislam.hw.health import Health
 from vislam.hw.source import CapturedImage
 
 _NS = 1_000_000_000
@@ -27,7 +22,6 @@ _EXPOSURES_PER_S = 10_000.0  # V4L2 counts exposure in units of 100 us
 _PROBED = 5  # images after which it is settled whose stamps are used
 _EARLY_NS = 2_000_000  # clocks are read one after the other
 _NO_CLOCK, _OWN_CLOCK = "arrival", "driver, clock of its own"
-_JOIN_S = 1.0  # a driver may hold a thread for 10 s; it is then left to end by itself
 
 
 class Capture(Protocol):
@@ -41,29 +35,12 @@ class Capture(Protocol):
     def release(self) -> None: ...  # noqa: D102
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """What was asked of the camera and what it reports to do; None: it does not offer it."""
-
-    name: str
-    asked: float | str
-    got: float | str | None
-
-    @property
-    def differs(self) -> bool:
-        """Whether the camera does something else."""
-        if isinstance(self.asked, float) and isinstance(self.got, float):
-            return abs(self.got - self.asked) > 0.02 * abs(self.asked)
-        return self.asked != self.got
-
-
-class Webcam:
-    """Satisfies `ImageSource`. A thread captures; `read` never waits for the driver.
+class Webcam(LibraryCamera[CapturedImage]):
+    """A camera on V4L2.
 
     Images are stamped by the driver where its clock is CLOCK_MONOTONIC or the wall clock. Stamps of a clock of the
     camera's own, whose rate may be off, are put on the line that lies under their arrivals, less `config.delay_s`;
-    without any stamps arrivals less as much have to do. `stamped_by` names which. A camera that goes away is looked
-    for every `config.reopen_s`.
+    without any stamps arrivals less as much have to do. `stamped_by` names which.
     """
 
     def __init__(
@@ -72,119 +49,84 @@ class Webcam:
         must_be_there: bool = True,
         open_capture: Callable[[str], Capture] | None = None,
     ) -> None:
-        """Open the camera and wait for its first image, `config.start_s` at most.
+        """Open the camera and wait for its first image, see `LibraryCamera`.
 
-        With `must_be_there` False nothing is waited for and a missing camera is no error. `open_capture` opens a
-        device file; OpenCV does it by default.
+        `open_capture` opens a device file; OpenCV does it by default.
 
         Raises:
             HardwareError: there is no such camera, it may not be opened, or it gives no image.
         """
-        self.path = device_path(config.device)
-        self.rate_hz = config.rate_hz
-        self.settings: tuple[Setting, ...] = ()
-        self.stamped_by = "not known yet"
-        self.problem = ""
-        self._config = config
-        self._open_capture = _open_v4l2 if open_capture is None else open_capture
-        self._mailbox: Mailbox[CapturedImage] = Mailbox()
-        self._counts: Counter[str] = Counter()  # written by the thread alone, after it has started
-        self._newest_ns = 0  # arrival
-        self._stamper = _Stamper(config)
-        self._stamp_ns = 0
-        self._shape: tuple[int, ...] | None = None
-        self._is_stopping = threading.Event()
-        self._has_tried = threading.Event()  # an image came, or the camera could not be opened
-        self._thread = threading.Thread(target=self._run, name="webcam", daemon=True)
-        self._thread.start()
-        if must_be_there:
-            self._has_tried.wait(config.start_s)
-            if self._newest_ns == 0:
-                self.close()
-                raise HardwareError(
-                    self.problem or f"{self.path} gives no image within {config.start_s:g} s; replug it"
-                )
-
-    def read(self, timeout_s: float) -> CapturedImage | None:
-        """Return the newest image, see `ImageSource`."""
-        return self._mailbox.take(timeout_s)
-
-    def health(self) -> Health:
-        """Return CAMERA_MISSING or nothing."""
-        missing = time.monotonic_ns() - self._newest_ns > self._config.missing_s * _NS
-        return Health.CAMERA_MISSING if missing else Health(0)
+        path, opened, known = device_path(config.device), open_capture or _open_v4l2, _Known(config)
+        self._left_out = known.left_out
+        super().__init__(path, lambda: WebcamStream(path, config, opened, known), config, must_be_there)
 
     def counters(self) -> dict[str, int]:
-        """Return images captured, replaced by newer ones before they were read, and faults since the start."""
-        return {**self._counts, "replaced": self._mailbox.replaced, "bad_stamps": self._stamper.bad}
+        """Return images captured, replaced or left out, each by its cause, and faults since the start."""
+        return {name: n for name, n in super().counters().items() if name != "unstamped"} | self._left_out
+
+
+class _Known:
+    """What is known of a camera, however often it is opened: its clock, the size of its images, what was left out."""
+
+    def __init__(self, config: WebcamConfig) -> None:
+        self.stamper = _Stamper(config)
+        self.shape: tuple[int, ...] | None = None
+        self.left_out: Counter[str] = Counter()
+
+    def takes(self, image: Any) -> bool:
+        """Return whether an image is usable, and count it if not."""
+        if image is None:
+            self.left_out["undecodable"] += 1
+            return False
+        self.shape = image.shape if self.shape is None else self.shape
+        if image.shape != self.shape:  # came back with another size: the calibration would be wrong
+            self.left_out["wrong_size"] += 1
+        return bool(image.shape == self.shape)
+
+
+class WebcamStream:
+    """Satisfies `Stream`: the device file, opened once."""
+
+    def __init__(self, path: str, config: WebcamConfig, open_capture: Callable[[str], Capture], known: _Known) -> None:
+        """Open the camera and set its format; raises HardwareError if it cannot be opened."""
+        if problem := why_not_there(path):
+            raise HardwareError(problem)
+        self._capture = open_capture(path)
+        if not self._capture.isOpened():
+            self._capture.release()
+            raise HardwareError(
+                f"{path} cannot be opened as a camera: another program has it, or it is no capture device"
+            )
+        self.settings: tuple[Setting, ...] = ()
+        self._path, self._config, self._known = path, config, known
+        self._bad_before = known.stamper.bad
+        _set_format(self._capture, config)
+
+    @property
+    def stamped_by(self) -> str:
+        """Whose clock stamps."""
+        return self._known.stamper.source
+
+    @property
+    def bad_stamps(self) -> int:
+        """Images whose own stamp could not be believed."""
+        return self._known.stamper.bad - self._bad_before
+
+    def next(self) -> CapturedImage | None:
+        """Return the next image; None for one that is left out. Raises HardwareError when the camera went away."""
+        if not self._capture.grab():
+            raise HardwareError(f"{self._path} went away or stopped giving images")
+        arrival_ns, driver_ms = time.monotonic_ns(), self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        stamp_ns = self._known.stamper.stamp(driver_ms, arrival_ns, time.time_ns())
+        is_decoded, image = self._capture.retrieve()
+        # some drivers forget what is set before the stream runs
+        if is_decoded and image is not None and not self.settings:
+            self.settings = _set_controls(self._capture, self._config)
+        return CapturedImage(stamp_ns, 0, image) if self._known.takes(image if is_decoded else None) else None
 
     def close(self) -> None:
-        """Give the camera back; may be called twice."""
-        self._is_stopping.set()
-        self._mailbox.close()
-        self._thread.join(_JOIN_S)
-
-    # ---- the thread -------------------------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        while not self._is_stopping.is_set():
-            capture = self._opened()
-            if capture is not None:
-                self._capture(capture)
-                capture.release()
-            self._has_tried.set()
-            self._is_stopping.wait(self._config.reopen_s)
-
-    def _opened(self) -> Capture | None:
-        """Return the camera with its format set; None, and `problem`, if it cannot be opened."""
-        problem = why_not_there(self.path)
-        if problem is None:
-            capture = self._open_capture(self.path)
-            if capture.isOpened():
-                self._counts["opened"] += 1
-                _set_format(capture, self._config)
-                return capture
-            capture.release()
-            problem = f"{self.path} cannot be opened as a camera: another program has it, or it is no capture device"
-        self.problem = problem
-        self._counts["open_failures"] += 1
-        return None
-
-    def _capture(self, capture: Capture) -> None:
-        """Capture until the camera goes away."""
-        have_controls = False
-        while not self._is_stopping.is_set():
-            if not capture.grab():
-                self._counts["lost"] += 1
-                self.problem = f"{self.path} went away or stopped giving images"
-                return
-            arrival_ns = time.monotonic_ns()
-            stamp_ns = self._stamper.stamp(capture.get(cv2.CAP_PROP_POS_MSEC), arrival_ns, time.time_ns())
-            is_decoded, image = capture.retrieve()
-            if not is_decoded or image is None:
-                self._counts["undecodable"] += 1
-                continue
-            if not have_controls:  # some drivers forget what is set before the stream runs
-                self.settings = _set_controls(capture, self._config)
-                have_controls = True
-            self._offer(image, stamp_ns, arrival_ns)
-
-    def _offer(self, image: Any, stamp_ns: int, arrival_ns: int) -> None:
-        self.stamped_by = self._stamper.source
-        self._shape = image.shape if self._shape is None else self._shape
-        if image.shape != self._shape:  # came back with another size: the calibration would be wrong
-            self._counts["wrong_size"] += 1
-            return
-        index = self._counts["captured"]
-        self._counts["captured"] += 1
-        self._newest_ns = arrival_ns
-        self.problem = ""
-        self._has_tried.set()
-        if stamp_ns <= self._stamp_ns:
-            self._counts["stamps_not_rising"] += 1
-            return
-        self._stamp_ns = stamp_ns
-        self._mailbox.put(CapturedImage(stamp_ns, index, image))
+        """Give the camera back."""
+        self._capture.release()
 
 
 class _Stamper:

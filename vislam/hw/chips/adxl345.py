@@ -1,7 +1,5 @@
 """The ADXL345 accelerometer: full resolution, FIFO in stream mode, self-test (data sheet, revision E)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.errors import HardwareError

@@ -6,8 +6,6 @@ given out is turned into the axes of the inertial chip (ICM-20948: DS-000189 sec
 section 9.1).
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

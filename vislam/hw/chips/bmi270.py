@@ -5,8 +5,6 @@ ArduPilot's and Bosch's own drivers. The configuration is Bosch's, under the BSD
 of vislam: the user names its file.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

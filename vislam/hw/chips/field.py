@@ -1,7 +1,5 @@
 """What the board asks of its magnetometer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """What a board asks of an inertial chip that keeps its samples in a FIFO until they are fetched."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

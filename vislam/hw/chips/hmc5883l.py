@@ -1,7 +1,5 @@
 """The HMC5883L magnetometer, and the DA5883, which differs in that its status register never works."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -4,8 +4,6 @@ Registers by the data sheet DS-000189 rev. 1.3 (sections 7 and 8, FIFO in 4.15),
 public drivers. The magnetometer answers at 0x0C from then on.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.errors import HardwareError

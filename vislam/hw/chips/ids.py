@@ -1,7 +1,5 @@
 """Which chips answer on a bus, by address and id."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 

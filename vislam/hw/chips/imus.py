@@ -1,7 +1,5 @@
 """The inertial chips with a FIFO: what they are called, where they sit, how they say who they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

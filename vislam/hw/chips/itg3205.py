@@ -1,7 +1,5 @@
 """The ITG3205 gyroscope (ITG3200 alike): range, filter, clock and temperature. It has neither FIFO nor self-test."""
 
-from __future__ import annotations
-
 import struct
 
 from vislam.core.errors import HardwareError

@@ -1,7 +1,5 @@
 """The LIS3MDL magnetometer of ST (data sheet DS9463, sections 6 and 7; compared with the kernel's st_magn driver)."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -4,8 +4,6 @@ Registers by the data sheets DS12814 (LSM6DSOX, sections 6 and 9) and DS13012 (I
 driver (lsm6dsox_reg.h) and the kernel's (st_lsm6dsx).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

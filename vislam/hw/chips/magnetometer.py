@@ -1,7 +1,5 @@
 """Which magnetometer is on a board, by address and id."""
 
-from __future__ import annotations
-
 from vislam.hw.chips import akm, hmc5883l, lis3mdl
 from vislam.hw.chips.bus import I2cBus
 from vislam.hw.chips.field import Magnetometer

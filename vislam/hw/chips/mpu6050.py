@@ -5,8 +5,6 @@ compared with the kernel's driver (inv_mpu_iio.h). A MPU-9250 has an AK8963 magn
 from then on.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.errors import HardwareError

@@ -1,7 +1,5 @@
 """Magnetometers that are sold as HMC5883L but are not: QMC5883L (marked DB5883) and QMC5883P."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

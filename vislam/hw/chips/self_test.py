@@ -1,7 +1,5 @@
 """What a chip's self-test found."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

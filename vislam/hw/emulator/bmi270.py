@@ -1,7 +1,5 @@
 """Virtual BMI270: does nothing before it was given its configuration; a FIFO of frames, by the data sheet."""
 
-from __future__ import annotations
-
 import struct
 
 from vislam.hw.emulator.fifo_chip import FifoChip

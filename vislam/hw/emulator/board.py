@@ -1,7 +1,5 @@
 """A whole virtual GY-85."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

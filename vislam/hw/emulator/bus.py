@@ -1,7 +1,5 @@
 """A virtual I2C adapter: answers what smbus2 asks of the kernel, with the faults that wires and plugs have."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import importlib

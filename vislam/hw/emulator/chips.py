@@ -1,7 +1,5 @@
 """Virtual ADXL345 and ITG3205: registers with their side effects, by the data sheets and the kernel's drivers."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections import deque

@@ -1,7 +1,5 @@
 """A whole virtual board whose inertial chip has a FIFO."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """What virtual inertial chips with a FIFO have in common: a clock of their own, two sensors, bytes that wait."""
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Virtual ICM-20948: registers in four banks, a FIFO of bytes that overwrites the oldest, by the data sheet."""
 
-from __future__ import annotations
-
 import struct
 
 from vislam.hw.emulator.fifo_chip import FifoChip

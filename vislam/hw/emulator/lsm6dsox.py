@@ -1,7 +1,5 @@
 """Virtual LSM6DSOX or ISM330DHCX: a FIFO of 512 tagged words, by the data sheets and the kernel's driver."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """Virtual HMC5883L (or DA5883), QMC5883L, QMC5883P, LIS3MDL, AK09916 and AK8963."""
 
-from __future__ import annotations
-
 import struct
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Virtual MPU-6050, MPU-6500, MPU-9250: a FIFO of bytes that overwrites the oldest, by the register maps."""
 
-from __future__ import annotations
-
 import struct
 
 from vislam.hw.emulator.fifo_chip import FifoChip

@@ -1,7 +1,5 @@
 """A clock that takes no time: sleeping moves it on at once, and so do transfers of an emulated bus."""
 
-from __future__ import annotations
-
 
 class SteppedClock:
     """Satisfies `vislam.hw.timing.Clock`; tests of minutes run in a second, the same every time."""

@@ -6,8 +6,6 @@ Axes forward-left-up become forward-right-down by a half turn about x, in `odom`
 arbitrary, as that of `odom` is) and in `base` (MAV_FRAME_BODY_FRD). https://mavlink.io/en/messages/common.html#ODOMETRY
 """
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable
@@ -20,6 +18,7 @@ from vislam.core.geometry import quaternion_wxyz
 from vislam.core.messages import Array
 from vislam.hw.descriptor import is_readable
 from vislam.hw.health import Health
+from vislam.live.notices import MapCells
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import send_address
 
@@ -69,6 +68,9 @@ class Mavlink:
                 )
             )
         self._send(odometry(pose))
+
+    def see(self, cells: MapCells) -> None:
+        """Do nothing: there is no message of a map."""
 
     def _send(self, message: common.MAVLink_message) -> None:
         with self._sending:

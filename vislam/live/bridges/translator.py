@@ -1,10 +1,9 @@
 """The published pose on other wires: each translator is a process of its own that listens as any controller does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
+from multiprocessing.connection import Connection
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +11,9 @@ import numpy as np
 from vislam.config import LiveConfig
 from vislam.core.errors import UsageError, install_line
 from vislam.core.messages import Array
+from vislam.live.notices import MapCells
 from vislam.live.processes.child import Life
+from vislam.live.wire.mail import Inbox
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import PoseListener, send_address, socket_path
 
@@ -27,15 +28,21 @@ class Wire(Protocol):
         """Send the pose in the translator's format."""
         ...
 
+    def see(self, cells: MapCells) -> None:
+        """Take the map as it is now; only who is given a wire of it is called."""
+        ...
+
     def close(self) -> None:
         """Let go of everything; may be called twice."""
         ...
 
 
-def asked(live: LiveConfig, T_body_cams: tuple[Array, ...] = ()) -> dict[str, tuple[str, Callable[[Life], None]]]:
+def asked(
+    live: LiveConfig, T_body_cams: tuple[Array, ...] = (), maps: Connection | None = None
+) -> dict[str, tuple[str, Callable[[Life], None]]]:
     """Return the translators that are asked for, by role: where each listens, and its process's body.
 
-    Of the cameras, at `T_body_cam` [4, 4] each, ROS 2 gets the frames.
+    ROS 2 gets the frames of the cameras, at `T_body_cam` [4, 4] each, and the map, of which `maps` brings `MapCells`.
 
     Raises UsageError: a package is not installed, or a domain, address or rate that is none.
     """
@@ -53,15 +60,17 @@ def asked(live: LiveConfig, T_body_cams: tuple[Array, ...] = ()) -> dict[str, tu
         _require("pymavlink", "mavlink", "--live.mavlink")
         send_address(live.mavlink, live.name, live.allow_remote)
         wires["mavlink"] = partial(_open_mavlink, live.mavlink, live.name, live.allow_remote)
-    return {role: _bridge(role, open_wire, live) for role, open_wire in wires.items()}
+    return {role: _bridge(role, open_wire, live, maps if role == "ros2" else None) for role, open_wire in wires.items()}
 
 
-def _bridge(role: str, open_wire: Callable[[], Wire], live: LiveConfig) -> tuple[str, Callable[[Life], None]]:
+def _bridge(
+    role: str, open_wire: Callable[[], Wire], live: LiveConfig, maps: Connection | None
+) -> tuple[str, Callable[[Life], None]]:
     at = f"unix:{socket_path(f'{live.name}-{role}')}"
-    return at, partial(run, at=at, rate_hz=live.bridge_rate_hz, open_wire=open_wire)
+    return at, partial(run, at=at, rate_hz=live.bridge_rate_hz, open_wire=open_wire, maps=maps)
 
 
-def run(life: Life, at: str, rate_hz: float, open_wire: Callable[[], Wire]) -> None:
+def run(life: Life, at: str, rate_hz: float, open_wire: Callable[[], Wire], maps: Connection | None = None) -> None:
     """Translate poses until the run ends.
 
     Args:
@@ -69,6 +78,7 @@ def run(life: Life, at: str, rate_hz: float, open_wire: Callable[[], Wire]) -> N
         at: where to listen.
         rate_hz: poses beyond this rate are left out.
         open_wire: opens the translator, in this process.
+        maps: from the map process; None: it gets none.
     """
     period_ns, due_ns, sent = round(1e9 / rate_hz), 0, 0
     listener = PoseListener(at)
@@ -77,7 +87,10 @@ def run(life: Life, at: str, rate_hz: float, open_wire: Callable[[], Wire]) -> N
         try:
             if not life.ready():
                 return
+            inbox = None if maps is None else Inbox(maps)
             while not life.stopped:
+                if inbox is not None and (cells := inbox.get()) is not None:
+                    wire.see(cells)
                 pose = listener.next(_LISTEN_S)
                 if pose is None or pose.published_ns < due_ns:
                     continue

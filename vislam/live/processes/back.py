@@ -1,7 +1,7 @@
 """The process of loops and graph: as slow as it has to be, and no other process waits for it."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
 
@@ -11,12 +11,14 @@ import numpy as np
 from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.clock import StageClock
+from vislam.core.messages import Array
 from vislam.imu import ImuNoise
 from vislam.live.beginning import Beginning, recalled
 from vislam.live.handover import BackBegun, BackEnded, EndedGraph, KeyframeOut
 from vislam.live.notices import MapMoved
 from vislam.live.processes.child import Life
 from vislam.live.rehearsal import rehearse
+from vislam.live.web.updates import Undo
 from vislam.live.wire.mail import Inbox, Outbox
 from vislam.pipeline.back import Back
 from vislam.sensors import Suite
@@ -26,7 +28,8 @@ _WAIT_S = 0.1
 
 def run(
     life: Life, config: Config, rig: Rig, noise: ImuNoise, keyframes: Connection, to_fast: Connection,
-    to_map: Connection, beginning: Beginning | None, suite: Suite,
+    to_map: Connection, beginning: Beginning | None, suite: Suite, web: Connection | None = None,
+    guesses: Sequence[Connection] = (),
 ) -> None:  # fmt: skip
     """Take keyframes until the front process ends them; then finish the graph and hand it over.
 
@@ -40,6 +43,8 @@ def run(
         to_map: `BackBegun` if there is a `beginning`, `KeyframeStep`, then `BackEnded`.
         beginning: the session that the run goes on from.
         suite: further sensors, whose readings come with keyframes.
+        web: `Undo` from the page that shows the run; None: there is none.
+        guesses: wires from who may say where the body is in the map, `T_map_body` [4, 4].
     """
     cv2.setNumThreads(1)
     config = replace(config, map=replace(config.map, enabled=False))
@@ -47,6 +52,7 @@ def run(
     clock = StageClock()
     back: Back | None = None
     inbox, outbox = Inbox(keyframes), Outbox(to_map, config.live.keyframe_queue)
+    undone = _Undone(web)
     begins_recording = beginning is not None
     if beginning is not None:
         memory = recalled(beginning)
@@ -66,14 +72,16 @@ def run(
             begins_recording = not back.begin_recording(keyframe.first_state, keyframe.odometry.T_odom_body)
             if begins_recording:
                 continue  # ended before gravity was known
-        step = back.add(keyframe.odometry, [])
+        for T_map_body in _waiting(guesses):
+            back.guess(T_map_body)
+        step = back.add(keyframe.odometry, [], undone.take())
         update = step.update
         _send(to_fast, MapMoved(update.revision, update.T_map_odom, update.submaps.is_joined))
         _put(life, outbox, step)
     if back is None:
         ended = BackEnded(None, None, None, {}, clock.summary_ms())
     else:
-        update = back.finish()
+        update = back.finish(undone.take())
         own = {name: found for name in suite.names if (found := back.graph.own(name)) is not None}
         sensed = {name: back.graph.sensed(name) for name in suite.names}
         graph = EndedGraph(
@@ -84,12 +92,33 @@ def run(
     outbox.close()
 
 
+class _Undone:
+    """Hears which loops the page takes out; they go with the next keyframe."""
+
+    def __init__(self, web: Connection | None) -> None:
+        self._inbox = None if web is None else Inbox(web)
+
+    def take(self) -> list[int]:
+        asked: list[int] = []
+        while self._inbox is not None and (message := self._inbox.get()) is not None:
+            asked += [message.loop_id] if isinstance(message, Undo) else []
+        return asked
+
+
 def _next(life: Life, keyframes: Inbox) -> KeyframeOut | None:
     while not (keyframes.is_over or life.is_orphan):
         keyframe: KeyframeOut | None = keyframes.get(_WAIT_S)
         if keyframe is not None:
             return keyframe
     return None
+
+
+def _waiting(wires: Sequence[Connection]) -> Iterator[Array]:
+    """Yield what waits in wires; one whose other side has gone has nothing any more."""
+    for wire in wires:
+        with suppress(EOFError, OSError):
+            while wire.poll():
+                yield wire.recv()
 
 
 def _send(to_fast: Connection, message: MapMoved) -> None:

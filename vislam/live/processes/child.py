@@ -223,8 +223,16 @@ def measured(life: Life, body: Callable[[Life], None]) -> None:
     `late_kernels` is how often, between ready and over, a kernel was called for the first time (twice as often where
     it is compiled): what had been rehearsed is 0.
     """
-    from vislam.core.cpu import compile_cpu_s, cpu_s, kernels_taken, peak_memory_mb  # loads numba, which not all need
+    from vislam.core.compiling import on_each_kernel  # both load numba, which not all need
+    from vislam.core.cpu import compile_cpu_s, cpu_s, kernels_taken, peak_memory_mb
 
+    compiled: list[str] = []
+
+    def show(name: str) -> None:
+        compiled.append(name)
+        life.note(compiled=len(compiled))
+
+    on_each_kernel(show)
     ready: list[int] = []  # kernels that were there then
     over: list[int] = []
     life.when_ready = lambda: ready.append(kernels_taken())

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import os
 import select
 import socket
+import struct
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +15,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from vislam.config import Config
+from vislam.config import Config, LiveConfig
 from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking, VoMeasurement, no_observations
 from vislam.ekf.correction import Correction
 from vislam.hw.health import Health
@@ -20,7 +23,6 @@ from vislam.hw.source import InertialSource
 from vislam.imu import AttitudeFilter, BiasMemory, ImuNoise
 from vislam.live.fast import FastPath
 from vislam.live.notices import Start, ToFast
-from vislam.live.priority import take_priority
 from vislam.live.processes.child import Life
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.live.wire.publisher import PosePublisher
@@ -34,6 +36,34 @@ _HEARTBEAT_NS = 50_000_000  # between poses while there are no samples, so that 
 _BIN_NS = 5_000  # of the histogram of latencies
 _BINS = 40_000  # up to 0.2 s; what is longer counts into the last
 _PARTS = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999}
+_ATTRIBUTES = struct.Struct("<IIQiIQQQ")  # sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # the number of the system call; Python has no function for it
+_TURN_NS = 500_000  # for a sample and a late frame; in shorter ones, cut apart, it falls behind on a busy machine
+
+
+def take_priority(live: LiveConfig, life: Life) -> None:
+    """Run before others: always where the system permits `live.realtime_priority`, else sooner than usual."""
+    if live.realtime_priority > 0:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(live.realtime_priority))
+            return
+        except OSError as error:
+            life.note(
+                warning=f"no real-time priority for the pose ({error}); see docs/cart.md, or --live.realtime-priority 0"
+            )
+    take_short_turns()
+
+
+def take_short_turns() -> None:
+    """Ask for short turns on the processor: since Linux 6.12 these may cut in on another's long one when they come.
+
+    Anybody may ask. An older kernel, or another processor than the usual ones, goes on as before.
+    """
+    number = _SCHED_SETATTR.get(os.uname().machine)
+    if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
+        return
+    attributes = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, os.nice(0), 0, _TURN_NS, 0, 0)
+    ctypes.CDLL(None).syscall(number, 0, attributes, 0)
 
 
 def run(
@@ -64,7 +94,7 @@ def run(
     """
     warm_up(config, noise, T_body_camera)
     take_priority(config.live, life)
-    publisher = PosePublisher(config.live.name, config.live.send_to, config.live.allow_remote)
+    publisher = PosePublisher(config.live.name, config.live.send_to, config.live.allow_remote, config.live.group)
     sender = SampleSender(samples)
     latency = _Latency()
     try:

@@ -1,7 +1,5 @@
 """The process that sees: frames and samples through the front half, corrections to the pose, keyframes to the back."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import time
@@ -21,18 +19,17 @@ from vislam.core.clock import StageClock
 from vislam.core.errors import DataError, HardwareError
 from vislam.core.messages import Array, Frame, ImuSample, Keyframe, no_observations
 from vislam.ekf.correction import Hint
-from vislam.frontend.start import Initialisation
 from vislam.hw.health import Health
+from vislam.hw.source import FrameSource, ReadingSource
 from vislam.imu import ImuNoise
 from vislam.live.beginning import Beginning
-from vislam.live.frames import FrameSource
+from vislam.live.corrections import Corrections
 from vislam.live.handover import FrontEnded, KeyframeOut, Seen
-from vislam.live.notices import CameraHealth, Doubted, Rebase, Start, ToFast
+from vislam.live.notices import CameraHealth, Doubted, ToFast
 from vislam.live.pace import Pace
 from vislam.live.processes.child import Life
-from vislam.live.reading_source import ReadingSource
 from vislam.live.rehearsal import rehearse_front
-from vislam.live.web.frame_share import FrameShare
+from vislam.live.web.updates import FrameUpdate
 from vislam.live.wire.mail import Outbox
 from vislam.live.wire.publisher import PoseReader
 from vislam.live.wire.stream import SampleReceiver, Value
@@ -53,6 +50,46 @@ _PUT_S = 0.1
 _SENSORS_S = 1.0  # between two words on how further sensors are
 _JUDGE_NS = 1_000_000_000  # of frames between verdicts: one costs a millisecond
 _STEPS = 4096  # frames that may wait for the map process: minutes; then it is stuck
+_FRAME_S = 0.2  # between two pictures
+_WIDTH_PX = 480
+_QUALITY = 70
+_MAX_REASON = 200
+
+
+class FrameShare:
+    """Shows the page frames, a few a second: where the last one was not taken yet, none."""
+
+    def __init__(self, to_web: Connection) -> None:
+        """Take the page's wire, to be used in this process only."""
+        self._box = Outbox(to_web, 1)
+        self._due_s = 0.0
+
+    def show(self, step: FrontStep) -> None:
+        """Show a frame with the points that vision follows, if it is time for one."""
+        now_s = time.monotonic()
+        if now_s < self._due_s or len(self._box) or self._box.is_broken:
+            return
+        self._due_s = now_s + _FRAME_S
+        track = step.track
+        jpeg = picture(step.frame, track.observations.pixels_px)
+        self._box.put(
+            FrameUpdate(step.frame.t_ns, jpeg, str(track.vo.tracking), track.vo.inliers, track.reason[:_MAX_REASON])
+        )
+
+
+def picture(frame: Frame, pixels_px: Array) -> bytes:
+    """Return a small JPEG of a frame with points [N, 2] on it; empty where the frame has no image."""
+    image = frame.color if frame.color is not None else frame.images[0] if frame.images else None
+    if image is None:
+        return b""
+    scale = min(1.0, _WIDTH_PX / image.shape[1])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    drawn = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR) if small.ndim == 2 else small
+    for x, y in ((pixels_px + 0.5) * scale - 0.5)[np.isfinite(pixels_px).all(axis=1)].tolist():
+        cv2.circle(drawn, (round(x), round(y)), 2, (90, 200, 60), -1, cv2.LINE_AA)
+    _, encoded = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return encoded.tobytes()
 
 
 def run(
@@ -115,7 +152,7 @@ class FrontProcess:
         self._life, self._config = life, config
         self._to_fast, self._to_back, self._to_map, self._share = to_fast, to_back, to_map, share
         self._frames: deque[Frame] = deque()
-        self._told_start: Initialisation | None = None
+        self._corrections = Corrections(self.front)
         self._begins_back = True
         self._camera_health = Health(0)
         self._verdict = Verdict(Trust.TRUSTED)
@@ -131,7 +168,8 @@ class FrontProcess:
         """Take frames, samples and readings until the samples end."""
         while not samples.ended and not self._life.is_orphan:
             self._hear(samples, readings)
-            self._send_readings()
+            for message in self._corrections.of_readings():
+                self._send(message)
             self._follow_sensors(readings)
             frame = camera.read(_READ_S)
             if frame is not None and self._pace.wants(frame):
@@ -210,7 +248,8 @@ class FrontProcess:
         self._counters["crowded_frames"] += is_crowded
         self._counters["back_late_ms"] = max(self._counters["back_late_ms"], round(1e3 * self._to_back.age_s))
         step = self.front.process(frame)
-        self._correct(step)
+        for message in self._corrections.of_step(step):
+            self._send(message)
         if self._share is not None:
             self._share.show(step)
         self._judge(frame.t_ns)
@@ -224,27 +263,6 @@ class FrontProcess:
             raise HardwareError(
                 "the map process does not take frames any more; is the disk of --out stuck, or the machine too slow?"
             )
-
-    def _correct(self, step: FrontStep) -> None:
-        """Send the fast process's filter what was applied to this one."""
-        found = self.front.begun.newest
-        if found is not self._told_start and found is not None and found.last is not None:
-            self._told_start = found
-            self._send(Start(found.last, step.track.vo))
-        if self.front.config.ekf.coupling == "tight":
-            if step.state is not None:
-                is_tracking = step.track.vo.tracking.sees
-                at_rest = any(correction.at_rest for correction in step.corrections)
-                self._send(Rebase(step.state, is_tracking, at_rest, self.front.noise_scale))
-            return
-        for correction in step.corrections:
-            self._send(replace(correction, observations=no_observations()))
-
-    def _send_readings(self) -> None:
-        """Send the fast process's filter the readings applied to this one; `Rebase` has them in its state."""
-        for applied in self.front.take_applied_readings():
-            if self.front.config.ekf.coupling != "tight":
-                self._send(applied)
 
     def _follow_sensors(self, readings: ReadingSource) -> None:
         """Note once a second how the further sensors are, and which of them slip."""

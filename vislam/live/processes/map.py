@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
@@ -15,18 +16,19 @@ import numpy as np
 
 from vislam.config import Config
 from vislam.core.clock import StageClock
-from vislam.core.errors import HardwareError
-from vislam.core.memory import Learned, SlamMemory, StartFacts
+from vislam.core.errors import DataError, HardwareError
+from vislam.core.memory import GraphRecord, Learned, SlamMemory, StartFacts
 from vislam.core.messages import Array, GraphUpdate
 from vislam.core.progress import Progress
 from vislam.core.recording import Recording
 from vislam.live.beginning import Beginning
 from vislam.live.handover import BackBegun, BackEnded, EndedGraph, FrontEnded, Seen
 from vislam.live.map_rehearsal import rehearse_map
+from vislam.live.notices import MapCells
 from vislam.live.pace import MapPace
 from vislam.live.processes.child import Life
 from vislam.live.web.map_share import MapShare
-from vislam.live.wire.mail import Inbox
+from vislam.live.wire.mail import Inbox, Outbox
 from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.stage import MapStage
@@ -44,12 +46,39 @@ from vislam.trajectory import Trajectory
 _LOG = logging.getLogger(__name__)
 _WAIT_S = 0.05
 _ALONE = "there was no camera and no further sensor: attitude alone was published, and there is no trajectory"
+_EVERY_S = 0.5
+
+
+class CellShare:
+    """Owns the wires; a reader that is slow gets fewer grids, the newest next."""
+
+    def __init__(self, wires: list[Connection]) -> None:
+        """Take the wires, to be used in this process only."""
+        self._boxes = [Outbox(wire, 1) for wire in wires]
+        self._is_new, self._is_silent = False, not wires
+        self._due_s = 0.0
+
+    def take(self, is_changed: bool, mapper: Mapper | None) -> None:
+        """Hand on the grid when it was changed and it is time."""
+        self._is_new |= is_changed
+        if self._is_silent or mapper is None or not self._is_new or time.monotonic() < self._due_s:
+            return
+        self._is_new, self._due_s = False, time.monotonic() + _EVERY_S
+        try:
+            grid = mapper.drive()
+        except DataError as error:
+            _LOG.warning("no map for those who drive by it: %s", error)
+            self._is_silent = True
+            return
+        cells = MapCells(grid.states, grid.resolution_m, grid.origin_m, grid.floor_m, grid.body_m)
+        for box in self._boxes:
+            self._is_new |= not box.put(cells)
 
 
 def run(
     life: Life, config: Config, recording: Recording, out: Path, source: str, command: list[str], frames: Connection,
     keyframes: Connection, beginning: Beginning | None, base: MapChoice | None, suite: Suite,
-    web: Connection | None = None,
+    web: Connection | None = None, drivers: Sequence[Connection] = (),
 ) -> None:  # fmt: skip
     """Follow the run until front and back have ended, then write the folder, as `vislam run` does.
 
@@ -66,6 +95,7 @@ def run(
         base: the map among them, if it is that of another run.
         suite: further sensors; with neither these nor a camera there is no trajectory, and none is asked for.
         web: the wire of the page that shows the run; None: there is none.
+        drivers: wires to those who drive by the map.
     """
     rehearse_map(config, recording.rig)
     clock = StageClock()
@@ -74,8 +104,8 @@ def run(
     pipeline = FollowedPipeline(life, clock, stage, Inbox(frames), Inbox(keyframes), pace)
     if beginning is not None:
         pipeline.wait_for_back()
-    share = None if web is None else MapShare(web, out)
-    make = partial(_LiveRun, recording, config, out, pipeline, recording.rig.is_blind and not suite, share)
+    shares = None if web is None else MapShare(web, out), CellShare([*drivers])
+    make = partial(_LiveRun, recording, config, out, pipeline, recording.rig.is_blind and not suite, shares)
     live: Run
     if beginning is not None and beginning.is_own:
         live = resumed = make(SessionWriter.reopen(out / "session.db"))
@@ -92,10 +122,11 @@ class _LiveRun(Run):
 
     def __init__(
         self, recording: Recording, config: Config, out: Path, followed: FollowedPipeline, is_alone: bool,
-        share: MapShare | None, session: SessionWriter,
+        shares: tuple[MapShare | None, CellShare], session: SessionWriter,
     ) -> None:  # fmt: skip
         super().__init__(recording, config, out, session, followed)
-        self._followed, self._share = followed, share
+        self._followed = followed
+        self._share, self._cells = shares
         self.wants_frames = not is_alone
         if is_alone:
             self.warnings.append(_ALONE)
@@ -113,12 +144,20 @@ class _LiveRun(Run):
         """Write all files; without map and pictures where the run has to end soon."""
         return super()._finish(start, is_brief or self._followed.life.is_brief)
 
+    def _settle(self, update: GraphUpdate, record: GraphRecord) -> None:
+        super()._settle(update, record)
+        if self._share is not None:
+            self._share.settle(update, record)
+
     def _feed(self, progress: Progress) -> None:
-        for step in self._followed.steps():
+        for n, step in enumerate(self._followed.steps()):
             was_found = self.joined_t_ns is not None
             self._take(step)
+            if n == 0:
+                self._followed.life.note(zero_ns=self.log.zero_ns)
             if self._share is not None:
                 self._share.take(step.keyframes, self._mapper)
+            self._cells.take(bool(step.keyframes), self._mapper)
             if self.joined_t_ns is not None and not was_found:
                 self._followed.life.note(found_in_map=True)
         self._followed.life.when_over()

@@ -1,7 +1,6 @@
 """The virtual cart as a source of a live run: `vislam live --source virtual-cart`."""
 
-from __future__ import annotations
-
+import math
 import os
 import tempfile
 import time
@@ -13,22 +12,25 @@ from pathlib import Path
 import numpy as np
 
 from vislam.config import USUAL_SLIP_M_S, Config, Gy85Config
+from vislam.core.camera import Rig
 from vislam.core.errors import DataError
-from vislam.core.messages import Frame, ImuSample, MagSample
-from vislam.hw.source import InertialSource
+from vislam.core.messages import Array, Frame, ImuSample, MagSample
+from vislam.core.readings import Reading
+from vislam.hw.source import FrameSource, InertialSource, ReadingSource
 from vislam.imu import ImuNoise
+from vislam.live.driving.pursuit import PathFollower
 from vislam.live.epoch import Epoch
-from vislam.live.frames import FrameSource, NoCamera
+from vislam.live.frames import NoCamera
 from vislam.live.processes.child import Life
-from vislam.live.reading_source import ReadingSource, refuse_unread
-from vislam.live.virtual.imu import VirtualGy85, open_board, run_board
-from vislam.live.virtual.motion import Drive, Segment, locate
-from vislam.live.virtual.pilot import CommandReader, PathFollower
+from vislam.live.reading_source import Heard, refuse_unread
+from vislam.live.virtual.imu import open_board, open_gy85, run_board
+from vislam.live.virtual.motion import Drive, Follower, Segment, locate
+from vislam.live.virtual.pilot import CommandReader
 from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, course, virtual_rig
 from vislam.live.virtual.virtual_camera import VirtualCamera, run_camera
-from vislam.live.virtual.virtual_readings import VirtualReadings
 from vislam.live.wire.slot import remove
-from vislam.sensors import SensorSetup
+from vislam.sensors import BodyState, SensorSetup
+from vislam.sensors.simulated import slipping, within
 from vislam.trajectory import Trajectory
 
 _NS = 1_000_000_000
@@ -40,6 +42,58 @@ _BRIDGE_HZ = 400.0  # of the sketch
 _FRAMES_MISSED = 4  # in a row: then vision counts as lost, however slow the camera is
 # the data sheets' noise, with what quantisation to 3.9 mg and 0.07 deg/s adds
 NOISE = ImuNoise(5.4e-4, 7.0e-3, 3.0e-5, 4.0e-4, 200.0, gyroscope_scale_sigma=0.0, accelerometer_scale_sigma=0.0)
+_KNOWN_S = 5.0  # of the motion; a later query misses what was before
+
+
+class VirtualReadings(Heard):
+    """Satisfies `ReadingSource`; own variables are drawn by their sigmas, as of a recording."""
+
+    def __init__(self, cart: str, epoch: Epoch, setup: SensorSetup, seed: int) -> None:
+        """Put the simulated sensors of a setup on the cart whose segments are published under a name."""
+        super().__init__(tuple(setup.simulated_hz))
+        self._follower, self._epoch, self._setup = Follower.waiting(cart), epoch, setup
+        self._rngs, self._own = {}, dict[str, Array]()
+        self._is_placed = dict.fromkeys(setup.simulated_hz, False)
+        for number, name in enumerate(setup.simulated_hz):
+            self._rngs[name] = np.random.default_rng([seed, number])
+            self._own[name] = setup.suite.drawn_own(name, self._rngs[name])
+        self._drawn = dict.fromkeys(setup.simulated_hz, 0)  # how many of each, those that were missed included
+        self._missed = dict.fromkeys(setup.simulated_hz, 0)
+
+    def read(self) -> list[Reading]:
+        """Return the readings whose time has come; see `ReadingSource`."""
+        begin_ns = self._epoch.begin_ns()
+        now_s = (time.monotonic_ns() - begin_ns) / _NS
+        out = []
+        for name, rate_hz in self._setup.simulated_hz.items():
+            while (t_s := self._drawn[name] / rate_hz) <= now_s:
+                self._drawn[name] += 1
+                if t_s < now_s - _KNOWN_S:
+                    self._missed[name] += 1
+                    continue
+                body = body_at(self._follower.at(t_s), begin_ns + round(t_s * _NS))
+                sensor, faults = self._setup.sensors[name], self._setup.simulated_faults[name]
+                if not self._is_placed[name]:  # about where it begins: where it will drive is unknown yet
+                    self._own[name] = sensor.about(body.position_m[None], self._own[name])
+                    self._is_placed[name] = True
+                values = sensor.draw(body, self._own[name].copy(), self._rngs[name])
+                if within(t_s, faults.slips):
+                    values = slipping(sensor, values, faults)
+                out.append(Reading(name, body.t_ns, values))
+        self.hear(out)
+        return out
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Return how many readings of each sensor were drawn, and how many were not asked for in time."""
+        return {name: {"drawn": count, "missed": self._missed[name]} for name, count in self.count.items()}
+
+
+def body_at(segment: Segment, t_ns: int) -> BodyState:
+    """Return the body at a time, above the middle of the axle, level."""
+    T, none = segment.T_world_body(BODY_HEIGHT_M), np.zeros(3)
+    ahead = np.array([math.cos(segment.yaw_rad), math.sin(segment.yaw_rad), 0.0])
+    rate = np.array([0.0, 0.0, segment.rate_rad_s])
+    return BodyState(t_ns, T[:3, :3], T[:3, 3], segment.speed_m_s * ahead, none, none, rate)
 
 
 class VirtualCart:
@@ -62,17 +116,8 @@ class VirtualCart:
         self._port = self._truth.with_suffix(".tty")
 
     def settings(self, config: Config) -> Config:
-        """Return the settings with what this cart knows of itself: wheels, and how high its one camera is."""
-        config = replace(config, machine=replace(config.machine, slip_sigma_m_s=USUAL_SLIP_M_S))
-        if self.rig.is_blind:
-            return config
-        timeout_s = max(config.live.vision_timeout_s, _FRAMES_MISSED / self.options.camera_hz)
-        config = replace(config, live=replace(config.live, vision_timeout_s=timeout_s))
-        front = config.frontend
-        if self.rig.has_depth or front.mode not in ("auto", "planar") or front.planar.height_m is not None:
-            return config
-        height_m = BODY_HEIGHT_M + float(self.rig.T_body_cams[0][2, 3])
-        return replace(config, frontend=replace(front, planar=replace(front.planar, height_m=height_m)))
+        """Return the settings with what this cart knows of itself, see `cart_settings`."""
+        return cart_settings(config, self.rig, self.options.camera_hz)
 
     @property
     def command_name(self) -> str:
@@ -88,7 +133,7 @@ class VirtualCart:
             return partial(open_board, self._port)
         config = replace(Gy85Config(), bus="/dev/i2c-virtual", rate_hz=NOISE.rate_hz)
         return partial(
-            VirtualGy85, f"{self._shared}-cart", self._epoch, config, self.options.seed, self._gravity_m_s2,
+            open_gy85, f"{self._shared}-cart", self._epoch, config, self.options.seed, self._gravity_m_s2,
             self.options.imu_out,
         )  # fmt: skip
 
@@ -146,6 +191,20 @@ class VirtualCart:
             remove(f"{self._shared}-{part}")
 
 
+def cart_settings(config: Config, rig: Rig, camera_hz: float) -> Config:
+    """Return the settings with what the virtual cart knows of itself: wheels, and how high its one camera is."""
+    config = replace(config, machine=replace(config.machine, slip_sigma_m_s=USUAL_SLIP_M_S))
+    if rig.is_blind:
+        return config
+    timeout_s = max(config.live.vision_timeout_s, _FRAMES_MISSED / camera_hz)
+    config = replace(config, live=replace(config.live, vision_timeout_s=timeout_s))
+    front = config.frontend
+    if rig.has_depth or front.mode not in ("auto", "planar") or front.planar.height_m is not None:
+        return config
+    height_m = BODY_HEIGHT_M + float(rig.T_body_cams[0][2, 3])
+    return replace(config, frontend=replace(front, planar=replace(front.planar, height_m=height_m)))
+
+
 def true_segments(path: Path) -> list[Segment]:
     """Read the segments that the cart's process wrote, whole ones only."""
     if not path.exists():
@@ -158,10 +217,9 @@ def true_segments(path: Path) -> list[Segment]:
 def _run_cart(life: Life, shared: tuple[str, Epoch, PlaceOptions], command_name: str, truth: Path) -> None:
     """Move the cart until the run ends, and write down how."""
     name, epoch, options = shared
-    way = course(options.laps)
-    follower = PathFollower(way)
+    follower = PathFollower(course(options.world, options.laps))
     commands = CommandReader(command_name)
-    drive = Drive(name, float(way[0, 0]), float(way[0, 1]), 0.0)
+    drive = Drive(name, *options.start)
     try:
         with truth.open("wb") as out:
             out.write(_bytes(drive.at(0.0)))

@@ -3,24 +3,25 @@
 Or behind the serial bridge: a process is the board, on a pseudo-terminal, and the real bridge and pyserial read it.
 """
 
-from __future__ import annotations
-
 import math
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 from vislam.config import Gy85Config, SensorsConfig
 from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.emulator import BridgeEmulator, LineFaults, Truth, emulated_bus, emulated_gy85, gy85_errors
+from vislam.hw.emulator import BridgeEmulator, LineFaults, SteppedClock, Truth, emulated_bus, emulated_gy85, gy85_errors
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.hw.sensors import open_inertial
 from vislam.hw.source import InertialSource
+from vislam.hw.timing import Clock, HostClock
 from vislam.live.epoch import Epoch
 from vislam.live.processes.child import Life
-from vislam.live.virtual.motion import Follower
+from vislam.live.virtual.motion import Follower, Segment
 
 _NS = 1_000_000_000
 _FIELD_UT = (18.2, -10.5, -43.0)  # central Europe, z up
@@ -28,23 +29,43 @@ _WARM_C = 25.0
 _DRIFT = 0.003  # of the board's clock: an Arduino's resonator is good to 0.005
 _PLUGGED_S = 60.0  # that the port is waited for
 _POLL_S = 0.005
+_CLOSING_S = 30.0  # that the port's reader may take to end
+
+
+class Moved(Protocol):
+    """The motion of a cart, as far as it was decided."""
+
+    def segment(self, t_s: float) -> Segment:
+        """Return the segment of a time since the beginning."""
+        ...
 
 
 class VirtualGy85:
     """Satisfies `InertialSource`; unplugged in each of `outages`."""
 
     def __init__(
-        self, cart: str, epoch: Epoch, config: Gy85Config, seed: int, gravity_m_s2: float,
-        outages: tuple[tuple[float, float], ...] = (),
+        self, cart: Moved, begin_ns: Callable[[], int], config: Gy85Config, seed: int, gravity_m_s2: float,
+        outages: tuple[tuple[float, float], ...] = (), stepped: SteppedClock | None = None,
     ) -> None:  # fmt: skip
-        """Put a board on the cart whose segments are published under a name, and open it with the driver."""
-        self._epoch, self._outages = epoch, outages
+        """Put a board on a cart, and open it with the driver.
+
+        Args:
+            cart: its motion.
+            begin_ns: when that begins; 0 while it is not known, and the cart stands.
+            config: of the driver.
+            seed: of errors and noise.
+            gravity_m_s2: where it drives.
+            outages: s since the beginning, from and to: unplugged.
+            stepped: the clock of a simulation that takes no time; None: that of the host.
+        """
+        self._begin_ns, self._outages = begin_ns, outages
+        self._clock: Clock = HostClock() if stepped is None else stepped
         self._stack = ExitStack()
-        truth = _truth(Follower.waiting(cart), epoch, gravity_m_s2)
-        self._board = emulated_gy85(truth, time.monotonic_ns, seed, path=config.bus)
+        truth = _truth(cart, begin_ns, gravity_m_s2)
+        self._board = emulated_gy85(truth, self._clock.now_ns, seed, path=config.bus, stepped=stepped)
         self._is_plugged = True
         self._stack.enter_context(emulated_bus(self._board))
-        self._driver = Gy85(config)
+        self._driver = Gy85(config, self._clock)
         self._stack.callback(self._driver.close)
         self.rate_hz = self._driver.rate_hz
 
@@ -59,7 +80,7 @@ class VirtualGy85:
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what the driver reads."""
-        plugged = not _is_within(self._outages, self._epoch.begin_ns())
+        plugged = not _is_within(self._outages, self._clock.now_ns() - self._begin_ns())
         if plugged != self._is_plugged:
             self._is_plugged = plugged
             (self._board.replug if plugged else self._board.unplug)()
@@ -86,13 +107,13 @@ def run_board(
 
     In each of `outages` it is `unplugged`, or has the fault of that name in `LineFaults`.
     """
-    truth = _truth(Follower.waiting(cart), epoch, gravity_m_s2)
+    truth = _truth(Follower.waiting(cart), epoch.peek_ns, gravity_m_s2)
     with BridgeEmulator(port, truth, seed, _DRIFT, gy85_errors(seed)) as board:
         if not life.ready():
             return
         begin_ns = epoch.begin_ns()
         while not life.stopped:
-            is_out = _is_within(outages, begin_ns)
+            is_out = _is_within(outages, time.monotonic_ns() - begin_ns)
             if fault != "unplugged":
                 board.faults = replace(LineFaults(), **{fault: is_out})
             elif is_out:
@@ -100,6 +121,7 @@ def run_board(
             else:
                 board.plug()
             time.sleep(_POLL_S)
+        board.await_closing(_CLOSING_S)  # or the reader, which may see the end later, would count a lost port
 
 
 def open_board(port: Path) -> InertialSource:
@@ -110,15 +132,22 @@ def open_board(port: Path) -> InertialSource:
     return open_inertial(f"serial:{port}", SensorsConfig())
 
 
-def _is_within(spans_s: tuple[tuple[float, float], ...], begin_ns: int) -> bool:
-    """Return whether it is now within one of some spans since a beginning."""
-    since_s = (time.monotonic_ns() - begin_ns) / _NS
+def open_gy85(
+    cart: str, epoch: Epoch, config: Gy85Config, seed: int, gravity_m_s2: float,
+    outages: tuple[tuple[float, float], ...],
+) -> VirtualGy85:  # fmt: skip
+    """Open the board of a cart whose segments are published under a name, see `VirtualGy85`."""
+    return VirtualGy85(Follower.waiting(cart), epoch.peek_ns, config, seed, gravity_m_s2, outages)
+
+
+def _is_within(spans_s: tuple[tuple[float, float], ...], since_ns: int) -> bool:
+    """Return whether a time since the beginning is within one of some spans."""
+    since_s = since_ns / _NS
     return any(begin <= since_s < end for begin, end in spans_s)
 
 
-def _truth(cart: Follower, epoch: Epoch, gravity_m_s2: float) -> Truth:
+def _truth(cart: Moved, begin_ns: Callable[[], int], gravity_m_s2: float) -> Truth:
     """Return what chips on the cart sense at a time: a body above the middle of the axle, level."""
-    begin_ns = epoch.peek_ns  # the cart stands until the epoch is known
 
     def at(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:
         zero_ns = begin_ns()

@@ -68,11 +68,11 @@ class Wheels:
 class Drive:
     """Turns commands into segments; owned by the process that steers."""
 
-    def __init__(self, name: str, x_m: float, y_m: float, yaw_rad: float, wheels: Wheels | None = None) -> None:
-        """Stand at a place; `name` is that of the shared memory that segments are published in."""
+    def __init__(self, name: str | None, x_m: float, y_m: float, yaw_rad: float, wheels: Wheels | None = None) -> None:
+        """Stand at a place; `name` is that of the shared memory that segments are published in, None: in none."""
         self._wheels = wheels or Wheels()
         self._segments = [Segment(0.0, x_m, y_m, yaw_rad, 0.0, 0.0, 0.0, 0.0)]
-        self._slot = SlotWriter(name, 8 * _COLUMNS * _KEPT)
+        self._slot = None if name is None else SlotWriter(name, 8 * _COLUMNS * _KEPT)
         self._publish()
 
     def advance(self, now_s: float, speed_m_s: float, rate_rad_s: float) -> list[Segment]:
@@ -97,12 +97,18 @@ class Drive:
         """Return the cart at a time that is kept."""
         return locate(self._segments, t_s)
 
+    def segment(self, t_s: float) -> Segment:
+        """Return the segment of a time that is kept."""
+        return _segment(self._segments, t_s)
+
     def close(self) -> None:
         """Remove the shared memory."""
-        self._slot.close()
+        if self._slot is not None:
+            self._slot.close()
 
     def _publish(self) -> None:
-        self._slot.write(np.array([_row(segment) for segment in self._segments]).tobytes())
+        if self._slot is not None:
+            self._slot.write(np.array([_row(segment) for segment in self._segments]).tobytes())
 
 
 class Follower:

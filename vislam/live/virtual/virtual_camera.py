@@ -1,18 +1,16 @@
 """The virtual cart's camera: a process renders what it sees, in real time, and the front process takes the newest."""
 
-from __future__ import annotations
-
 import struct
 import time
 
 import cv2
 import numpy as np
 
-from vislam.core.messages import Frame, ImageF32
+from vislam.core.messages import Frame, ImageF32, ImageU8
 from vislam.hw.health import Health
 from vislam.live.epoch import Epoch
 from vislam.live.processes.child import Life
-from vislam.live.virtual.motion import Follower
+from vislam.live.virtual.motion import Follower, Segment
 from vislam.live.virtual.place import BODY_HEIGHT_M, PlaceOptions, make_scene, virtual_rig
 from vislam.live.wire.slot import SlotReader, SlotWriter, wait_for
 from vislam.sim.scene import Renderer
@@ -24,21 +22,34 @@ _MISSING_NS = 500_000_000
 _POLL_S = 0.001
 
 
+class Eye:
+    """What the cart's camera sees from where it is."""
+
+    def __init__(self, options: PlaceOptions) -> None:
+        """Paint its world; takes seconds."""
+        self.rig = virtual_rig(options)
+        camera = self.rig.cameras[0]
+        self._scene, self._renderer = make_scene(options.world, options.seed), Renderer(camera)
+        self._imager = Imager(camera.width, camera.height, noisy=True)
+        self._rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(5,)))
+
+    def see(self, here: Segment) -> tuple[ImageU8, ImageF32 | None]:
+        """Return the grey image [H, W] and, of a camera with depth, that [H, W]; the next call has other noise."""
+        light, exact = self._renderer.render(self._scene, here.T_world_body(BODY_HEIGHT_M) @ self.rig.T_body_cams[0])
+        grey = cv2.cvtColor(self._imager.sense(light, 1.0, self._rng), cv2.COLOR_BGR2GRAY).astype(np.uint8)
+        return grey, sense_depth(exact, DepthNoise(), self._rng) if self.rig.has_depth else None
+
+
 def run_camera(life: Life, name: str, cart: str, epoch: Epoch, options: PlaceOptions) -> None:
     """Render frames until the run ends; one that cannot be rendered in time is left out."""
-    rig = virtual_rig(options)
-    camera = rig.cameras[0]
-    scene, renderer = make_scene(options.seed), Renderer(camera)
-    imager = Imager(camera.width, camera.height, noisy=True)
-    rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(5,)))
-    slot = SlotWriter(name, _HEAD.size + camera.width * camera.height * (5 if rig.has_depth else 1))
+    eye = Eye(options)
+    camera = eye.rig.cameras[0]
+    slot = SlotWriter(name, _HEAD.size + camera.width * camera.height * (5 if eye.rig.has_depth else 1))
 
     def picture(t_s: float) -> bytes:
         """Return what the slot holds of an image after its head."""
-        T = follower.at(t_s).T_world_body(BODY_HEIGHT_M) @ rig.T_body_cams[0]
-        light, exact = renderer.render(scene, T)
-        grey = cv2.cvtColor(imager.sense(light, 1.0, rng), cv2.COLOR_BGR2GRAY)
-        return grey.tobytes() + (sense_depth(exact, DepthNoise(), rng).tobytes() if rig.has_depth else b"")
+        grey, depth_m = eye.see(follower.at(t_s))
+        return grey.tobytes() + (b"" if depth_m is None else depth_m.tobytes())
 
     try:
         follower = Follower.waiting(cart)

@@ -1,7 +1,5 @@
 """Where the web page of a live run listens: HOST:PORT, opened before anything else starts."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 import socket

@@ -1,7 +1,6 @@
 """What browsers see of a run: the newest of everything, bounded, under one lock."""
 
-from __future__ import annotations
-
+import re
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -26,6 +25,61 @@ _PATH_STEP_M = 0.02
 _MOST_FRAMES = 600  # that the plot of vision remembers: two minutes
 _NS = 1e-9
 _STATES = tuple(Tracking)
+_BY_PHASE = {
+    "waiting": "The run waits for Start.",
+    "ending": "The run ends: it is being written down.",
+}
+
+
+def sigma_m(pose: PublishedPose) -> float:
+    """Return the sigma of a pose's position, over all axes; infinite where it is unknown."""
+    variance = float(np.trace(pose.pose_covariance[:3, :3]))
+    return float(np.sqrt(max(variance, 0.0))) if np.isfinite(variance) else np.inf
+
+
+def headline(status: Mapping[str, Any], pose: PublishedPose | None, frame: FrameUpdate | None) -> dict[str, str]:
+    """Return `state` and `text` of the line; of an invalid pose also `sigma` and `reason`.
+
+    `state` is "invalid", that of the verdict, or "plain" where there is no pose to judge.
+    """
+    phase, verdict = status.get("phase"), status.get("verdict") or {}
+    if phase == "running" and pose is not None:
+        sigma = f"± {sigma_m(pose):.2f} m" if np.isfinite(sigma_m(pose)) else "position unknown"
+        if Health.INVALID in pose.health:
+            reason = _why_invalid(pose, frame)
+            return {
+                "state": "invalid", "text": f"Invalid, {sigma}: {reason}. Do not steer by it.", "sigma": sigma,
+                "reason": reason,
+            }  # fmt: skip
+        return _judged(verdict or {"state": "trusted"}, f", {sigma}")
+    if verdict:
+        return _judged(verdict, "")
+    return {"state": "plain", "text": _BY_PHASE.get(str(phase), "") or _no_pose(status)}
+
+
+def _judged(verdict: Mapping[str, Any], sigma: str) -> dict[str, str]:
+    """Return the verdict with the first words of its first reason; the page has them all further below."""
+    reasons = verdict.get("reasons") or ["nothing in the run contradicts itself"]
+    first = re.split("[:;] ", reasons[0], maxsplit=1)[0]
+    more = f", and {len(reasons) - 1} more reason{'s' * (len(reasons) > 2)}" if len(reasons) > 1 else ""
+    state = str(verdict["state"])
+    return {"state": state, "text": f"{state.capitalize()}{sigma}: {first}{more}."}
+
+
+def _no_pose(status: Mapping[str, Any]) -> str:
+    line = str(status.get("line") or "no pose yet")
+    return line[:1].upper() + line[1:] + "."
+
+
+def _why_invalid(pose: PublishedPose, frame: FrameUpdate | None) -> str:
+    seen = f"vision is {frame.tracking}: {frame.reason}" if frame is not None and frame.reason else ""
+    if Health.IMU_MISSING in pose.health:
+        return "no samples come from the IMU"
+    if not np.isfinite(pose.vision_age_s) and Health.VISION_OK not in pose.health:
+        return seen or "nothing has measured a position yet"
+    if Health.DEAD_RECKONING in pose.health:
+        return f"nothing has corrected it for {pose.vision_age_s:.1f} s" + (f"; {seen}" if seen else "")
+    return "it drifted too far, and what corrects it again does not suffice yet"
 
 
 class Feed:
@@ -49,6 +103,7 @@ class Feed:
         with self._lock:
             if isinstance(update, Status):
                 self._status = update.values
+                self._zero_ns = update.values.get("zero_ns", self._zero_ns)
             elif isinstance(update, FrameUpdate):
                 self._frame = update
                 self._jpeg, self._pictures = update.jpeg, self._pictures + 1
@@ -80,6 +135,8 @@ class Feed:
         with self._lock:
             return {
                 **self._status,
+                "headline": headline(self._status, self._pose, self._frame),
+                "notices": [[*notice[:2], self._since(notice[2])] for notice in self._status.get("notices", ())],
                 "pose": None if self._pose is None else self._pose_json(self._pose),
                 "picture": self._pictures,
                 "path": self._path.answer(query),
@@ -109,6 +166,10 @@ class Feed:
         with self._lock:
             return self._jpeg
 
+    def _since(self, t_ns: int) -> float | None:
+        """Return seconds since the start of the run; None before it."""
+        return None if self._zero_ns is None or t_ns < self._zero_ns else (t_ns - self._zero_ns) * _NS
+
     def _begin(self, t_ns: int) -> None:
         self._zero_ns = t_ns if self._zero_ns is None else self._zero_ns
 
@@ -119,7 +180,7 @@ class Feed:
             "xyz": T[:3, 3].tolist(),
             "R": T[:3, :3].ravel().tolist(),
             "speed_m_s": float(np.linalg.norm(pose.velocity_m_s)),
-            "sigma_m": float(np.sqrt(max(np.trace(pose.pose_covariance[:3, :3]), 0.0))),
+            "sigma_m": sigma_m(pose),
             "vision_age_s": pose.vision_age_s,
             "health": [(flag.name or "").lower() for flag in pose.health],
         })  # fmt: skip
@@ -164,7 +225,8 @@ class _Keyframes:
         self._epoch, self._revision = 0, 0
         self._poses: dict[int, tuple[int, Array]] = {}
         self._clouds: dict[int, tuple[int, KeyframeCloud]] = {}
-        self._loops: dict[tuple[int, int], LoopUpdate] = {}
+        self._loops: dict[tuple[int, int, str], LoopUpdate] = {}
+        self._decided: dict[str, int] = {}
         self._graph_revision = self._left_out = 0
 
     def take(self, update: MapUpdate) -> None:
@@ -173,9 +235,10 @@ class _Keyframes:
         for i, T in update.T_map_body.items():
             self._poses[i] = (self._revision, T[:3].astype(np.float32))
         self._clouds |= {i: (self._revision, cloud) for i, cloud in update.clouds.items()}
-        self._loops |= {(loop.from_id, loop.to_id): loop for loop in update.loops}
-        for pair in [*self._loops][: max(len(self._loops) - _MOST_LOOPS, 0)]:
-            del self._loops[pair]
+        self._loops |= {(loop.from_id, loop.to_id, loop.source): loop for loop in update.loops}
+        self._decided = update.decided or self._decided
+        for key in [*self._loops][: max(len(self._loops) - _MOST_LOOPS, 0)]:
+            del self._loops[key]
         if len(self._poses) > _MOST_KEYFRAMES:
             self._thin()
         self._trim()
@@ -205,6 +268,7 @@ class _Keyframes:
             "graph_revision": self._graph_revision,
             "keyframes": len(self._poses),
             "points": sum(len(cloud.xyz) for _, cloud in self._clouds.values()),
+            "loops": self._decided,
             "left_out": self._left_out,
         }
 
@@ -230,7 +294,7 @@ class _Keyframes:
             "ids": packed(np.array(ids), "<u4"),
             "T": packed(T, "<f4"),
             "clouds": clouds,
-            "loops": [[*pair, loop.decision, loop.reason] for pair, loop in self._loops.items()],
+            "loops": [[loop.from_id, loop.to_id, loop.decision, loop.reason, loop.id] for loop in self._loops.values()],
         }
 
 

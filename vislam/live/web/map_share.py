@@ -1,9 +1,10 @@
 """What the map process puts into the page's wire: keyframes, points and loops, left out without a reader."""
 
-from __future__ import annotations
-
 import time
+from collections import Counter
+from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -11,22 +12,86 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import VislamError, storage_failure
-from vislam.core.messages import Array, GraphUpdate, ImageU8, Keyframe
+from vislam.core.memory import GraphRecord, LoopPlace, LoopState
+from vislam.core.messages import Array, GraphUpdate, ImageU8, Keyframe, LoopCandidate, LoopDecision, LoopEdge
 from vislam.live.web.updates import KeyframeCloud, LoopUpdate, MapUpdate, Save, Saved
 from vislam.live.wire.mail import Outbox
+from vislam.loop import INJECTED, is_injected
 from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mapper import Mapper
 from vislam.pipeline.steps import KeyframeStep
 from vislam.trajectory import Trajectory, write_tum
 
 _MAP_S = 0.5  # between two words of the map
+_SETTLE_S = 1.0  # that the end of the run may wait for the page
 _CLOUD_POINTS = 2000  # of one keyframe
 _STEP_M = 1e-3
 _MOST_WAITING = 64  # clouds that wait for the page; further ones are left out
-_MOST_LOOPS = 1000  # that wait
 _VOXEL_M = 0.04
-_MAX_REASON = 200
 SAVED = ("saved/cloud.ply", "saved/trajectory.tum")  # in the run folder; the next time replaces them
+_MAX_REASON = 200
+_Ends = tuple[int, int, bool]  # of an edge, and whether it was made up on purpose
+
+
+class LoopShare:
+    """Follows the verifier, and the graph, which has the last word about what the verifier let through."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._edges: dict[_Ends, int] = {}
+        self._ends: dict[int, _Ends] = {}  # by edge
+        self._offered: dict[_Ends, list[LoopUpdate]] = {}
+        self._counts: Counter[str] = Counter()
+        self._changed: dict[tuple[int, int, str], LoopUpdate] = {}  # since `take_changed`
+
+    def found(self, candidates: Iterable[LoopCandidate], edges: Iterable[LoopEdge]) -> None:
+        """Take what the verifier made of candidates, and the edges of those that it offered to the graph.
+
+        One pair of keyframes may be a candidate several times, as it is in the table: pending, then offered.
+        """
+        for edge in edges:
+            ends = edge.from_id, edge.to_id, is_injected(edge.id)
+            self._edges[ends], self._ends[edge.id] = edge.id, ends
+        for c in candidates:
+            loop = LoopUpdate(c.from_id, c.to_id, c.source, str(c.decision), c.reason)
+            if c.decision is LoopDecision.ACCEPTED:
+                self._offered.setdefault((c.from_id, c.to_id, c.source == INJECTED), []).append(loop)
+            self._counts[loop.decision] += 1
+            self._show(loop, loop.reason)
+
+    def decided(self, states: Iterable[LoopState]) -> None:
+        """Take what the graph decided."""
+        for state in states:
+            ends = self._ends.get(state.id)
+            if ends is None or self._edges[ends] != state.id:
+                continue  # of an earlier run, or replaced
+            decision = "undone" if state.place is LoopPlace.UNDONE else str(state.decision)
+            before = self._offered.get(ends, [])
+            self._counts.subtract(loop.decision for loop in before)
+            self._counts[decision] += len(before)
+            self._offered[ends] = [replace(loop, decision=decision, id=state.id) for loop in before]
+            for loop in self._offered[ends]:
+                self._show(loop, f"{loop.reason}; {state.reason}")
+
+    def take_changed(self) -> list[LoopUpdate]:
+        """Return what changed since the last call."""
+        changed, self._changed = self._changed, {}
+        return [*changed.values()]
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether there is something to take."""
+        return bool(self._changed)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many candidates there are of each decision."""
+        return {decision: count for decision, count in self._counts.items() if count}
+
+    def _show(self, loop: LoopUpdate, reason: str) -> None:
+        key = loop.from_id, loop.to_id, loop.source
+        self._changed.pop(key, None)  # the newest stand last
+        self._changed[key] = replace(loop, reason=reason[-_MAX_REASON:])
 
 
 class MapShare:
@@ -42,7 +107,7 @@ class MapShare:
         self._poses: dict[int, Array] = {}
         self._times: dict[int, int] = {}
         self._clouds: dict[int, KeyframeCloud] = {}
-        self._loops: list[LoopUpdate] = []
+        self._loops = LoopShare()
         self._revision = self._left_out = 0
 
     def take(self, steps: list[KeyframeStep], mapper: Mapper | None) -> None:
@@ -54,10 +119,8 @@ class MapShare:
             self._poses[keyframe.id] = step.update.T_map_odom @ step.odometry.T_odom_body
             self._times[keyframe.id] = keyframe.t_ns
             self.move(step.update)
-            self._loops += [
-                LoopUpdate(c.from_id, c.to_id, str(c.decision), c.reason[:_MAX_REASON]) for c in step.candidates
-            ]
-            self._loops = self._loops[-_MOST_LOOPS:]
+            self._loops.found(step.candidates, step.edges)
+            self._loops.decided(step.record.loops)
             for keyframe_id in sorted({keyframe.id, *step.scans}):
                 self._add_cloud(keyframe_id, keyframe, mapper)
         for keyframe_id, T in self._poses.items() if steps else ():
@@ -72,14 +135,21 @@ class MapShare:
         self._revision = max(self._revision, update.revision)
         self._poses.update(zip(update.ids.tolist(), update.T_map_body, strict=True))
 
-    def flush(self) -> None:
-        """Hand on what is new, if the page has taken what came before."""
-        if not (self._poses or self._loops) or len(self._box):
+    def settle(self, update: GraphUpdate, record: GraphRecord) -> None:
+        """Show the map as it is in the end."""
+        self.move(update)
+        self._loops.decided(record.loops)
+        self.flush(_SETTLE_S)
+
+    def flush(self, patience_s: float = 0.0) -> None:
+        """Hand on what is new, if the page has taken what came before, or does so within `patience_s`."""
+        if not (self._poses or self._loops.has_changed) or (len(self._box) and not patience_s):
             return
-        update = MapUpdate(self._revision, self._poses, self._times, self._clouds, self._loops, self._left_out)
-        if self._box.put(update):
+        loops, counts = self._loops.take_changed(), self._loops.counts
+        update = MapUpdate(self._revision, self._poses, self._times, self._clouds, loops, counts, self._left_out)
+        if self._box.put(update, patience_s):
             self._due_s = time.monotonic() + _MAP_S
-            self._poses, self._times, self._clouds, self._loops = {}, {}, {}, []
+            self._poses, self._times, self._clouds = {}, {}, {}
 
     def _add_cloud(self, keyframe_id: int, newest: Keyframe, mapper: Mapper | None) -> None:
         if len(self._clouds) >= _MOST_WAITING:

@@ -1,7 +1,5 @@
 """The page's side in the process that owns the run: starts the server, sends it the run's state, takes commands."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import deque
@@ -28,7 +26,7 @@ _LINGER_S = 1.5  # that browsers have to hear of the end
 _NOTICES = 12
 _MAX_TEXT = 300
 _TOLD_OF_FRONT = ("verdict", "every", "sensors")
-_TOLD_OF_MAP = ("found_in_map", "map_left_out")
+_TOLD_OF_MAP = ("found_in_map", "map_left_out", "zero_ns")
 
 
 class Station:
@@ -48,20 +46,21 @@ class Station:
         self.address = f"http://{host}:{port}/"
         self.url = f"{self.address}#{gate.token}"  # a fragment is in no log: browsers do not send it
         self._out, self.is_well, self._due_s = out, True, 0.0
-        self._notices: deque[tuple[str, str]] = deque(maxlen=_NOTICES)
+        self._notices: deque[tuple[str, str, int]] = deque(maxlen=_NOTICES)
         context = get_context("spawn")
         owner, to_owner = context.Pipe()
         frames, to_frames = context.Pipe(duplex=False)
         map_wire, to_map = context.Pipe()
-        self.ends = WebEnds(to_frames, to_map)
+        from_back, back_wire = context.Pipe(duplex=False)
+        self.ends = WebEnds(to_frames, to_map, from_back)
         self._signals = Signals(Flag(), Flag())
         self._signals.go.set()
         body = partial(
             web_process.run, listener=listener, gate=gate, owner=to_owner, frames=frames, map_wire=map_wire,
-            pose_name=pose_name,
+            back_wire=back_wire, pose_name=pose_name,
         )  # fmt: skip
         self._child = Child.started("web", self._signals, body)
-        for end in (to_owner, frames, map_wire):
+        for end in (to_owner, frames, map_wire, back_wire):
             end.close()
         listener.close()
         self._box, self._inbox = Outbox(owner, 2), Inbox(owner)
@@ -116,7 +115,7 @@ class Station:
         if self._child.process.is_alive():
             self._child.process.kill()
             self._child.process.join()
-        for end in (self.ends.frames, self.ends.map):
+        for end in (self.ends.frames, self.ends.map, self.ends.back):
             end.close()
 
     def _watch(self) -> None:
@@ -132,14 +131,14 @@ class Station:
 class _Notices(logging.Handler):
     """Keeps the newest of what is logged."""
 
-    def __init__(self, kept: deque[tuple[str, str]]) -> None:
+    def __init__(self, kept: deque[tuple[str, str, int]]) -> None:
         super().__init__(logging.INFO)
         self._kept = kept
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep the first line."""
+        """Keep the first line, and when that was."""
         said = record.getMessage().partition("\n")[0][:_MAX_TEXT]
-        self._kept.append((record.levelname.lower(), said))
+        self._kept.append((record.levelname.lower(), said, time.monotonic_ns()))
 
 
 def _phase(run: LiveRun) -> str:

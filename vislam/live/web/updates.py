@@ -1,7 +1,5 @@
 """Messages of a run's processes to the one that serves its page. Plain values; nothing here loads a heavy package."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
@@ -18,6 +16,7 @@ class WebEnds:
 
     frames: Connection
     map: Connection  # both ways: the page asks the map process to save
+    back: Connection  # the page's user takes out loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +55,14 @@ class KeyframeCloud:
 
 @dataclass(frozen=True, slots=True)
 class LoopUpdate:
-    """A loop candidate that was decided about."""
+    """A loop candidate, with the newest decision about it: that of the graph, if it was offered to it."""
 
     from_id: int
     to_id: int
-    decision: str
+    source: str
+    decision: str  # a LoopDecision, or "undone"
     reason: str
+    id: int = -1  # of the graph's edge; -1: it was not offered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,13 +73,21 @@ class MapUpdate:
     T_map_body: dict[int, Array] = field(default_factory=dict)  # of keyframes that are new or moved
     t_ns: dict[int, int] = field(default_factory=dict)  # of keyframes that are new
     clouds: dict[int, KeyframeCloud] = field(default_factory=dict)
-    loops: list[LoopUpdate] = field(default_factory=list)
+    loops: list[LoopUpdate] = field(default_factory=list)  # those that are new or decided otherwise
+    decided: dict[str, int] = field(default_factory=dict)  # how many candidates of the whole run, by decision
     left_out: int = 0  # clouds that the page was too slow for, so far
 
 
 @dataclass(frozen=True, slots=True)
 class Save:
     """The page asks for what there is of the map, as files in the run folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Undo:
+    """The page's user takes a loop out of the graph."""
+
+    loop_id: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,6 @@ A foreign page that is open in the same browser must reach nothing: its requests
 Sec-Fetch-Site, and a name of its own that it points at this machine (DNS rebinding) is in Host.
 """
 
-from __future__ import annotations
-
 import hmac
 import secrets
 from dataclasses import dataclass, field

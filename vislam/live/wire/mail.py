@@ -4,8 +4,6 @@
 killed, and waits for ever for the rest of what it was writing.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

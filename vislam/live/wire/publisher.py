@@ -1,7 +1,5 @@
 """Hands poses out: the newest in shared memory, each as a datagram. And the reader of both."""
 
-from __future__ import annotations
-
 import os
 import socket
 from contextlib import suppress
@@ -9,7 +7,7 @@ from pathlib import Path
 
 from vislam.core.errors import DataError, UsageError
 from vislam.live.wire.published_pose import SIZE, PublishedPose, pack, unpack
-from vislam.live.wire.slot import SlotReader, SlotWriter
+from vislam.live.wire.slot import SlotReader, SlotWriter, give_to_group
 
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
@@ -48,7 +46,9 @@ class PosePublisher:
         counters: poses published, datagrams that a slow reader's full buffer refused.
     """
 
-    def __init__(self, name: str, send_to: tuple[str, ...] = ("unix",), allow_remote: bool = False) -> None:
+    def __init__(
+        self, name: str, send_to: tuple[str, ...] = ("unix",), allow_remote: bool = False, group: str | None = None
+    ) -> None:
         """Open everything.
 
         Args:
@@ -56,9 +56,10 @@ class PosePublisher:
             send_to: where each pose goes as a datagram: "unix" (NAME.sock in the runtime folder), "unix:PATH",
                 "udp:HOST:PORT".
             allow_remote: whether hosts beyond this machine are meant.
+            group: whose members may read the shared memory, too.
 
         Raises:
-            UsageError: an address that is none, or beyond this machine without `allow_remote`.
+            UsageError: an address that is none, or beyond this machine without `allow_remote`; a group that is none.
             StorageError: the shared memory cannot be made.
         """
         self.counters = {"published": 0, "datagrams_refused": 0}
@@ -67,7 +68,7 @@ class PosePublisher:
         for target, _ in self._targets:
             target.setblocking(False)
         self._usual, self._is_shared = str(socket_path(name)), "XDG_RUNTIME_DIR" not in os.environ
-        self._slot = SlotWriter(name, SIZE)
+        self._slot = SlotWriter(name, SIZE, group)
 
     def publish(self, pose: PublishedPose) -> None:
         """Hand a pose out; without a listener, nothing happens."""
@@ -94,9 +95,12 @@ class PosePublisher:
 class PoseReader:
     """Reads the newest pose from shared memory: for a controller that asks when it wants to know."""
 
-    def __init__(self, name: str) -> None:
-        """Open what `vislam live --live.name NAME` publishes. Raises DataError when it does not run."""
-        self._name, self._slot = name, SlotReader(name)
+    def __init__(self, name: str, owner: str | None = None) -> None:
+        """Open what `vislam live --live.name NAME` publishes; another user's `--live.group` wants its `owner` named.
+
+        Raises DataError when it does not run.
+        """
+        self._name, self._owner, self._slot = name, owner, SlotReader(name, owner)
 
     def latest(self) -> PublishedPose | None:
         """Return the newest pose, None before the first.
@@ -105,7 +109,7 @@ class PoseReader:
         """
         if self._slot.is_replaced:
             with suppress(DataError):  # it has gone again, or is not ours
-                follower = SlotReader(self._name)
+                follower = SlotReader(self._name, self._owner)
                 self._slot.close()
                 self._slot = follower
         read = self._slot.read()
@@ -119,10 +123,10 @@ class PoseReader:
 class PoseListener:
     """Receives every pose as a datagram: for a controller that is to run when a pose comes."""
 
-    def __init__(self, at: str) -> None:
+    def __init__(self, at: str, group: str | None = None) -> None:
         """Bind to "unix:PATH" or "udp:HOST:PORT", one of the addresses that `vislam live` sends to.
 
-        Raises UsageError when that cannot be bound.
+        Members of `group` may send there, too. Raises UsageError when it cannot be bound or there is no such group.
         """
         family, address = send_address(at, "vislam", allow_remote=True)
         self._path = Path(address) if isinstance(address, str) else None
@@ -135,6 +139,11 @@ class PoseListener:
             if self._path is not None:  # before it has a name: no other user may send poses to it
                 os.fchmod(self._socket.fileno(), 0o600)
             self._socket.bind(address)
+            if self._path is not None:
+                give_to_group(self._path, group, 0o660)
+        except UsageError:
+            self.close()
+            raise
         except OSError as error:
             self._socket.close()
             raise UsageError(f"cannot listen at {at}: {error}; choose another address") from error

@@ -2,22 +2,24 @@
 
 A sequence counter before and after the value (a seqlock) shows a reader that the writer came in between; a checksum
 shows the same on processors that reorder writes. The file in /dev/shm is what `shm_open` opens in C. It belongs to the
-user who runs the writer: no other can read it, and no other's is read.
+user who runs the writer: no other can read it but the members of a group that is named, and no other's is read but that
+of an owner who is named.
 """
-
-from __future__ import annotations
 
 import errno
 import mmap
 import os
+import pwd
 import secrets
+import shutil
+import stat
 import struct
 import time
 import zlib
 from contextlib import suppress
 from pathlib import Path
 
-from vislam.core.errors import DataError, StorageError
+from vislam.core.errors import DataError, StorageError, UsageError
 
 _HEAD = struct.Struct("<QII")  # sequence, length of the value, its CRC-32
 _TAIL = struct.Struct("<Q")  # sequence again
@@ -28,10 +30,10 @@ _FOLDER = Path("/dev/shm")
 class SlotWriter:
     """Owns the memory: makes it, replaces what a killed process left there, and removes it when closed."""
 
-    def __init__(self, name: str, capacity: int) -> None:
-        """Make `/dev/shm/NAME` for values of at most `capacity` bytes.
+    def __init__(self, name: str, capacity: int, group: str | None = None) -> None:
+        """Make `/dev/shm/NAME` for values of at most `capacity` bytes, to be read by the members of `group`, too.
 
-        Raises StorageError when it cannot be made.
+        Raises StorageError when it cannot be made, UsageError when there is no such group.
         """
         self._path = _FOLDER / name
         self._capacity = capacity
@@ -43,11 +45,14 @@ class SlotWriter:
                 # not ftruncate, which promises pages that a full /dev/shm lacks: writing there would kill the process
                 os.posix_fallocate(descriptor, 0, _HEAD.size + capacity + _TAIL.size)
                 self._memory = mmap.mmap(descriptor, _HEAD.size + capacity + _TAIL.size)
+                give_to_group(descriptor, group, 0o640)
             finally:
                 os.close(descriptor)
             fresh.rename(self._path)  # readers of an older one keep it, and see that it gets no newer
-        except OSError as error:
+        except (OSError, UsageError) as error:
             fresh.unlink(missing_ok=True)
+            if isinstance(error, UsageError):
+                raise
             is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
             step = f"{_FOLDER} is full: remove what is left there" if is_full else "choose another --live.name"
             raise StorageError(f"shared memory {self._path} cannot be made: {error.strerror}; {step}") from error
@@ -75,17 +80,19 @@ class SlotWriter:
 class SlotReader:
     """Reads what a `SlotWriter` of another process wrote last."""
 
-    def __init__(self, name: str) -> None:
-        """Open `/dev/shm/NAME`. Raises DataError when it does not exist, or is another user's."""
-        path = _FOLDER / name
+    def __init__(self, name: str, owner: str | None = None) -> None:
+        """Open `/dev/shm/NAME`; `owner` is a user who may have written it, besides this one and root.
+
+        Raises DataError when it does not exist, is another user's, or others may write to it.
+        """
+        path, trusted = _FOLDER / name, {os.geteuid(), 0} | ({user_of(owner)} if owner else set())
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
                 found = os.fstat(descriptor)
-                if found.st_uid not in (os.geteuid(), 0):
-                    raise DataError(
-                        f"shared memory {path} is that of user {found.st_uid}, who may write anything into it"
-                    )
+                if found.st_uid not in trusted or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                    who = f"that of user {found.st_uid}, who" if found.st_uid not in trusted else "open to others, who"
+                    raise DataError(f"shared memory {path} is {who} may write anything into it")
                 self._memory = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
             finally:
                 os.close(descriptor)
@@ -127,6 +134,24 @@ class SlotReader:
     def close(self) -> None:
         """Let go of the memory; may be called twice."""
         self._memory.close()
+
+
+def give_to_group(file: int | Path, group: str | None, mode: int) -> None:
+    """Let the members of a group do with a file what `mode` has; raises UsageError where there is none such."""
+    if group is not None:
+        try:
+            shutil.chown(file, group=group)
+        except (LookupError, PermissionError) as error:
+            raise UsageError(f"group {group}: {error}; give one that this user is in (`id -Gn`)") from error
+        os.chmod(file, mode)
+
+
+def user_of(name: str) -> int:
+    """Return the number of a user; raises UsageError where there is none such."""
+    try:
+        return pwd.getpwnam(name).pw_uid
+    except KeyError as error:
+        raise UsageError(f"there is no user {name}; give the one who runs `vislam live`") from error
 
 
 def remove(name: str) -> None:

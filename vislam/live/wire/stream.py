@@ -1,7 +1,5 @@
 """Inertial samples from the fast process to the front process: nothing is dropped, and the sender never waits."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Callable

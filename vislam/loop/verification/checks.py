@@ -4,8 +4,6 @@ Enough inliers alone do not do: what remains wrong after PnP is the right place 
 exists twice. The first shows in its own measurement; which of two places it is, only the graph can tell.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.angles import angle_between

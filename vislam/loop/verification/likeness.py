@@ -18,6 +18,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.loop.view import View
 from vislam.vision.features import match
+from vislam.vision.hamming import packed
 
 _MATCH_RATIO = 0.8  # nearest to second nearest descriptor; 0.8 keeps true matches of repeated texture out
 MATCH_MAX_DISTANCE = 64  # bits of 256; unrelated ORB descriptors are 128 apart
@@ -28,6 +29,9 @@ _MAX_TOLD = 64  # of them that are compared: bounds the time to 0.2 ms
 _SIGMAS = 3.0
 _BEYOND_DOUBT = 2.0
 _FAR_APART = 2.0  # tolerances; nearer points keep their distance whatever they are
+_APART_PX = 16.0  # between two features that look alike, at least: nearer ones are of one corner
+_MOST = 400  # features that are compared, at most: bounds the time to some milliseconds
+_AS_MANY = 0.5  # of the features that the most frequent step has, for a shorter one to be the period
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +65,30 @@ def compare(a: View, b: View, config: LoopConfig, px: float) -> Likeness:
     points_a, points_b = a.points_or_nan()[told[:, 0]], b.points_or_nan()[told[:, 1]]
     rigid = rigid_count(points_a, points_b, INVERSE_DEPTH_SIGMA_1_M, INLIER_PX * px)
     return Likeness(pairs, rigid, rigid >= config.min_rigid or len(pairs) >= _BEYOND_DOUBT * least)
+
+
+def repeated_step(view: View, px: float, least: int) -> Array | None:
+    """Return the shortest step [3] in cam0, metres, by which a place looks like itself, as a wall of equal panels does.
+
+    None where fewer than `least` features do; `px` is one pixel on the plane z = 1.
+    """
+    known = np.flatnonzero(view.known)
+    known = known[:: max(-(-len(known) // _MOST), 1)]
+    if len(known) < least:
+        return None
+    points, xy, bits = view.points_or_nan()[known], view.xy[known], packed(view.descriptors[known])
+    unlike = np.bitwise_count(bits[:, None] ^ bits[None]).sum(axis=2, dtype=np.int64)
+    unlike[np.linalg.norm(xy[:, None] - xy[None], axis=2) < _APART_PX * px] = MATCH_MAX_DISTANCE + 1
+    alike = np.argmin(unlike, axis=1)
+    found = np.flatnonzero(unlike[np.arange(len(known)), alike] <= MATCH_MAX_DISTANCE)
+    steps, z_m = points[alike[found]] - points[found], np.maximum(points[alike[found], 2], points[found, 2])
+    slack_m = INVERSE_DEPTH_SIGMA_1_M * z_m**2 + INLIER_PX * px * z_m
+    there, back = (np.linalg.norm(steps[:, None] - sign * steps[None], axis=2) for sign in (1.0, -1.0))
+    votes = np.sum(np.minimum(there, back) <= np.maximum(slack_m[:, None], slack_m[None]), axis=1)
+    often = np.flatnonzero(votes >= max(least, _AS_MANY * votes.max(initial=0)))
+    if not len(often):
+        return None
+    return np.asarray(steps[often[np.argmin(np.linalg.norm(steps[often], axis=1))]])
 
 
 @njit(cache=True, nogil=True)

@@ -6,24 +6,30 @@ rotation and direction. The covariance is that of the fit, inflated and floored 
 (`LoopConfig`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import LoopConfig
 from vislam.core.camera import Rig
 from vislam.core.geometry import invert, se3_adjoint, transform
-from vislam.core.messages import Array
-from vislam.loop.verification.epipolar import relative_direction
+from vislam.core.messages import Array, LoopEdge
 from vislam.loop.verification.guided import match_guided
-from vislam.loop.verification.likeness import INLIER_PX, INVERSE_DEPTH_SIGMA_1_M, MATCH_MAX_DISTANCE, Likeness, compare
+from vislam.loop.verification.likeness import (
+    INLIER_PX,
+    INVERSE_DEPTH_SIGMA_1_M,
+    MATCH_MAX_DISTANCE,
+    Likeness,
+    compare,
+    repeated_step,
+)
 from vislam.loop.verification.relative_pose import Matched, errors, refine
 from vislam.loop.view import View
 from vislam.vision.locate import pnp
-from vislam.vision.ransac import usac
+from vislam.vision.two_view import epipolar_distances, essential_ransac, refine_two_view
 
 _GUIDED_RADIUS_PX = 8.0  # search around a point's predicted place once a pose is known
 _SEARCH_RADIUS_PX = 24.0  # and where only its turn is known
@@ -40,6 +46,77 @@ _PNP_TRIES = 300  # finds 12 inliers among 50 matches with 0.98; more mostly pro
 _PNP_LOCAL_TRIES = 1  # OpenCV's five find the same inliers in twice the time; the pose is refined here afterwards
 _MIN_AGREEING = 8  # matches with two points before their agreement is judged
 _REFINE_PASSES = 2  # guided matching, then once more with the better pose
+_MIN_MATCHES = 8
+_TRIES = 400  # find 25 inliers among 60 matches with 0.99; more mostly prolong the search in vain
+_CAUCHY = 2.0  # in sigmas
+_LIMIT_SIGMAS = 3.0  # of an inlier
+_MEDIAN_CHI2_1 = 0.4549  # median of chi-square with one degree of freedom
+_BOTH_ENDS = 2.0**0.5  # a keypoint is as noisy in one view as in the other
+_CONFIDENCE = 0.999
+
+
+def usac(threshold: float, tries: int, seed: int, local_tries: int | None = None) -> Any:
+    """Return OpenCV's settings for an inlier's `threshold` on z = 1 and a largest number of tries.
+
+    `local_tries` refine each new best one; None leaves OpenCV's number.
+    """
+    settings = cv2.UsacParams()
+    settings.randomGeneratorState = seed % 2**31
+    settings.threshold = threshold
+    settings.confidence = _CONFIDENCE
+    settings.maxIterations = tries
+    settings.sampler = cv2.SAMPLING_UNIFORM
+    settings.score = cv2.SCORE_METHOD_MSAC
+    settings.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    if local_tries is not None:
+        settings.loIterations = local_tries
+    settings.isParallel = False
+    return settings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Direction:
+    """Rotation and unit direction between two cameras."""
+
+    T_a_b: Array  # [4, 4], translation of length 1
+    covariance: Array  # [6, 6] of the fit, perturbed in b, singular along the direction
+    inliers: NDArray[np.bool_]  # [N]
+    parallax: float  # median displacement of the inliers that rotation does not explain, on z = 1
+    plane_share: float  # of the inliers that one plane explains; near 1, two directions fit equally well
+
+
+def relative_direction(xy_a: Array, xy_b: Array, limit: float, seed: int) -> Direction | None:
+    """Return rotation and direction from matches [N, 2] on z = 1 with inlier `limit` there; None when there is none."""
+    start = essential_ransac(None, xy_a, xy_b, limit, _MIN_MATCHES, usac(limit, _TRIES, seed))
+    if start is None:
+        return None
+    R, direction, inliers = start
+    seen = np.where(inliers[:, None], xy_b, np.nan)
+    sigma = _BOTH_ENDS * limit / _LIMIT_SIGMAS
+    found = refine_two_view(R, direction, xy_a, seen, sigma, _CAUCHY)
+    inliers = found.inliers
+    if not found.converged or np.count_nonzero(inliers) < _MIN_MATCHES:
+        return None
+    R, in_b = found.R_key_cam, np.eye(6)
+    T_a_b = np.asarray(transform(R, found.direction_key))
+    in_b[3:, 3:] = R.T
+    turned = np.column_stack([xy_b[inliers], np.ones(np.count_nonzero(inliers))]) @ R.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_a[inliers], axis=1)
+    plane = _plane_share(xy_a[inliers], xy_b[inliers], 2.0 * limit, seed)
+    # keypoints scatter less than a limit made for the worst of them says, too
+    scatter = np.median(epipolar_distances(T_a_b, xy_a, seen)[inliers] ** 2) / (_MEDIAN_CHI2_1 * sigma**2)
+    covariance = found.covariance * scatter / max(1.0, found.variance)
+    return Direction(T_a_b, in_b @ covariance @ in_b.T, inliers, float(np.nanmedian(shift)), plane)
+
+
+def _plane_share(xy_a: Array, xy_b: Array, limit: float, seed: int) -> float:
+    """Return the largest share of matches [N, 2] that one homography explains."""
+    try:
+        _, mask = cv2.findHomography(xy_a, xy_b, usac(limit, _TRIES, seed))
+    except cv2.error:  # degenerate samples only
+        return 1.0
+    return 1.0 if mask is None else float(np.mean(mask.ravel() > 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +134,11 @@ class Verification:
     reverse_agreement: float = float("nan")  # share of matches that also agree the other way round; NaN: none could
     depth_agreement: float = float("nan")  # share of matches with two depths whose depths agree; NaN: too few
     pairs: NDArray[np.int64] | None = None  # [M, 2] features of a and b that agree with the pose; without one, matched
+
+    def edge(self, number: int, from_id: int, to_id: int, score: float) -> LoopEdge:
+        """Return the pose that was found as an edge."""
+        assert self.T_a_b is not None and self.covariance is not None
+        return LoopEdge(number, from_id, to_id, self.T_a_b, self.covariance, self.has_scale, self.inliers, score)
 
 
 class Verifier:
@@ -100,17 +182,31 @@ class Verifier:
         if found.T_a_b is None:
             return found
         off_m = float(np.linalg.norm(found.T_a_b[:3, 3] - T_guess[:3, 3]))
-        if off_m <= _ALIKE_M:
-            return found
-        T = transform(np.ascontiguousarray(found.T_a_b[:3, :3]), np.ascontiguousarray(T_guess[:3, 3]))
+        return found if off_m <= _ALIKE_M else self._fitting(a, b, found, T_guess[:3, 3], 0.5 * off_m) or found
+
+    def rivals(self, a: View, b: View, found: Verification) -> list[Verification]:
+        """Return what fits one step further along or back as well, where the older view looks like itself there."""
+        step = None if found.T_a_b is None else repeated_step(a, self._px, self._config.min_inliers)
+        if step is None or found.T_a_b is None or not found.has_scale:
+            return []
+        t, step_m = found.T_a_b[:3, 3], self._T_body_cam[:3, :3] @ step
+        fits = [
+            self._fitting(a, b, found, t + sign * step_m, 0.5 * float(np.linalg.norm(step))) for sign in (-1.0, 1.0)
+        ]
+        return [one for one in fits if one is not None]
+
+    def _fitting(self, a: View, b: View, found: Verification, t_m: Array, reach_m: float) -> Verification | None:
+        """Return what fits within a reach of another translation [3] than the one found; None: nothing does."""
+        assert found.T_a_b is not None
+        T = transform(np.ascontiguousarray(found.T_a_b[:3, :3]), np.ascontiguousarray(t_m))
         T_cams = invert(self._T_body_cam) @ T @ self._T_body_cam
         for radius_px in (_SEARCH_RADIUS_PX, _GUIDED_RADIUS_PX):
             again = self._refine(a, b, T_cams, found.matches, found.inliers, radius_px)
             if again.T_a_b is None or again.supporters < _TWICE * self._config.min_inliers:
-                return found
+                return None
             T_cams = invert(self._T_body_cam) @ again.T_a_b @ self._T_body_cam
-        nearer = again.T_a_b is not None and np.linalg.norm(again.T_a_b[:3, 3] - T_guess[:3, 3]) < 0.5 * off_m
-        return replace(again, inliers=min(again.inliers, again.supporters)) if nearer else found
+        is_near = again.T_a_b is not None and np.linalg.norm(again.T_a_b[:3, 3] - t_m) < reach_m
+        return replace(again, inliers=min(again.inliers, again.supporters)) if is_near else None
 
     def _pnp(self, a: View, b: View, pairs: NDArray[np.int64]) -> tuple[Array, int] | None:
         """Return T_a_b [4, 4] of the cameras and its inliers, from the side that knows more matched points."""
@@ -185,17 +281,15 @@ class Verifier:
         xy_a, xy_b = a.xy[pairs[:, 0]].astype(np.float64), b.xy[pairs[:, 1]].astype(np.float64)
         found = relative_direction(xy_a, xy_b, _EPIPOLAR_PX * self._px, self._pair_seed(a, b))
         count = 0 if found is None else int(np.count_nonzero(found.inliers))
+        reason = ""
         if found is None or count < config.min_inliers_direction:
-            reason = (
-                f"too few matches fit one direction: {count} of {len(pairs)}, "
-                f"needs {config.min_inliers_direction} without depth"
-            )
-            return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
-        if found.parallax < _MIN_PARALLAX_PX * self._px:
+            reason = f"{count} of {len(pairs)}, needs {config.min_inliers_direction} without depth"
+            reason = f"too few matches fit one direction: {reason}"
+        elif found.parallax < _MIN_PARALLAX_PX * self._px:
             reason = f"the views are too near: parallax {found.parallax / self._px:.1f} px, needs {_MIN_PARALLAX_PX:g}"
-            return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
-        if found.plane_share > _MAX_PLANE_SHARE:
+        elif found.plane_share > _MAX_PLANE_SHARE:
             reason = f"two directions fit, all is on one plane: {found.plane_share:.0%} of the matches"
+        if reason or found is None:
             return Verification(reason, len(pairs), count, has_scale=False, pairs=pairs)
         R = self._T_body_cam[:3, :3]
         T_a_b = np.eye(4)
@@ -203,9 +297,8 @@ class Verifier:
         T_a_b[:3, 3] = R @ found.T_a_b[:3, 3]  # the lever arm is of unknown size against a unit direction
         turn = np.kron(np.eye(2), R)
         covariance = turn @ found.covariance @ turn.T * config.covariance_inflation
-        across = np.eye(3) - np.outer(
-            found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3], found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3]
-        )
+        in_b = found.T_a_b[:3, :3].T @ found.T_a_b[:3, 3]
+        across = np.eye(3) - np.outer(in_b, in_b)
         covariance[:3, :3] += np.eye(3) * np.deg2rad(config.sigma_floor_deg) ** 2
         covariance[3:, 3:] += R @ across @ R.T * np.deg2rad(_DIRECTION_FLOOR_DEG) ** 2
         return Verification(

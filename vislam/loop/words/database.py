@@ -6,8 +6,6 @@ and again, in a thread whose compiled parts run beside the rest. What a training
 over are counted in keyframes, so a replay gives the same bytes however long a training took.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ Open3D's `smooth_mls` (0.20 and newer) ends with the plane: curved surfaces shri
 much again (experiments/cloud_smoothing.py).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree

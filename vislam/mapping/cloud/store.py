@@ -1,7 +1,5 @@
 """What is kept of every keyframe so that the map can be made again from other poses: some 60 to 120 kB each."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass, replace
 

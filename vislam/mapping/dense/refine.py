@@ -5,8 +5,6 @@ equations of all pairs rebuilt at the poses of all keyframes in every step, so n
 The poses that came in are priors, of each keyframe and of each against the one before: what surfaces do not show stays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ around the guess from several starts (`vision.depth_alignment`), and answers whe
 overlaps fits, nothing is seen through, and no other start ends in another place that fits as well.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

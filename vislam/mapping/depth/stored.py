@@ -1,7 +1,5 @@
 """The stored scans of a map as what answers where a depth camera is in it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial

@@ -5,8 +5,6 @@ Rendering", ToG 2023: logarithms of the scales, the logit of the opacity, a quat
 coefficient of the constant spherical harmonic.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

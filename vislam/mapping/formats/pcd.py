@@ -4,8 +4,6 @@ Version 0.7 (https://pointclouds.org/documentation/tutorials/pcd_file_format.htm
 number, 0x00RRGGBB, in a field `rgb`. Not Open3D's writer: an extra, 141 MB more memory for a million points (ours 0).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import BinaryIO
 

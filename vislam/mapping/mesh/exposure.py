@@ -4,8 +4,6 @@ Gains as in Brown and Lowe, "Automatic panoramic image stitching using invariant
 and per channel: a camera's gamma turns a longer exposure into a factor, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth images at their poses: of keyframes, as a map keeps them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 

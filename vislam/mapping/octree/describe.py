@@ -1,7 +1,5 @@
 """What an octree holds, and what is at a place of it, in plain values for people and JSON."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ apart; places beyond the key range are unknown. A map that is being written to m
 as the copy that `CorrectedOccupancy` swapped out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ A parallel projection of points as discs into a depth buffer, shaded by eye-dome
 depth alone and makes shapes readable. numpy and OpenCV only: a report needs no viewer and no graphics driver.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

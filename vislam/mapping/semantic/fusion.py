@@ -4,8 +4,6 @@ What each keyframe said is kept on its own rays, as its depth is. So a correctio
 that was counted has moved, votes are counted again, and the result is that of the same poses from scratch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

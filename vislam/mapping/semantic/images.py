@@ -1,7 +1,5 @@
 """Label images: which class each pixel of the colour image shows, from a folder or from any network."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The labels of a map: the label of each occupied voxel, and the things that connected voxels of one label make up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """The labels of a map as files: `labels.ply`, a point per voxel, and `labels.json`, classes and things."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Questions to the labels of a map: what is here, and where is the nearest thing of a kind?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The directions of the surfaces in a depth image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ way its surfaces look (floors and tables are seen from above, the wall ahead is 
 what was seen lies across or along it. The best one is made exact by all surfaces near it, robustly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

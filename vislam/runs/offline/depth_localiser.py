@@ -1,7 +1,5 @@
 """The depth of a finished run, for finding a camera in its map again by depth alone: `depth_localiser("runs/flat")`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from vislam.core.errors import DataError, UsageError

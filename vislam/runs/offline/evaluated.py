@@ -1,7 +1,5 @@
 """The trajectories that a run left, with what its own report judged them by."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Both count pixels from the corner of the first one, where ours count from its ce
 are those of `map`, in metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -152,6 +150,8 @@ class _ImageWriter:
     def _take(self, i: int, frame: Frame) -> None:
         side = int(self._found.camera[i])
         image = frame.color if side == 0 and frame.color is not None else frame.images[side]
+        if not image.size:  # of a further camera
+            image = np.zeros((self._found.cameras[side].height, self._found.cameras[side].width), np.uint8)
         self._colour(i, image)
         depth, mask = None, frame.mask(side)
         if side == 0 and frame.depth_m is not None:

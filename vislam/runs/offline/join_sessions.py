@@ -1,7 +1,5 @@
 """Several sessions joined into one pose graph by loops between them: the library's side of `vislam optimize A B`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,7 +16,7 @@ from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
 from vislam.core.errors import TrackingLostError, UsageError
-from vislam.core.files import write_json, write_text
+from vislam.core.files import write_json, write_lines
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.core.progress import Progress, silent
@@ -91,7 +89,7 @@ def write_joined(joined: JoinedSessions, out: Path) -> None:
         f"{e.from_session},{e.from_id},{e.to_session},{e.to_id},{e.has_scale:d},{e.inliers},{e.chi2:.9g},{e.kept:d}"
         for e in joined.loops
     ]
-    write_text(out / "loops.csv", "\n".join(rows) + "\n")
+    write_lines(out / "loops.csv", rows)
     write_json(out / "summary.json", joined.summary)
 
 

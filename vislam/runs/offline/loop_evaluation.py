@@ -1,7 +1,5 @@
 """How good the loops of a finished run are, stage by stage, against its truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.config import LoopTruthConfig
 from vislam.core.errors import DataError
-from vislam.core.files import write_json, write_text
+from vislam.core.files import csv_text, write_json, write_text
 from vislam.core.messages import Array, LoopDecision, RetrievedKeyframe
 from vislam.factors import rig_from
 from vislam.loop import (
@@ -25,7 +23,6 @@ from vislam.loop import (
     TruePlaces,
     Vocabulary,
     bootstrap_interval,
-    csv_text,
     precision_recall,
     read_loops,
     read_retrieved,
@@ -326,13 +323,8 @@ def _edges(edges: list[JudgedEdge]) -> dict[str, Any]:
     degrees = np.array([edge.error_deg for edge in edges])
 
     def spread(values: Array) -> dict[str, float | None]:
-        if not len(values):
-            return {"median": None, "p95": None, "max": None}
-        return {
-            "median": float(np.median(values)),
-            "p95": float(np.percentile(values, 95)),
-            "max": float(values.max()),
-        }
+        known = map(float, np.percentile(values, [50.0, 95.0, 100.0])) if len(values) else [None] * 3
+        return dict(zip(("median", "p95", "max"), known, strict=True))
 
     worst = sorted(edges, key=lambda edge: (-edge.is_gross, -edge.error_m))[:_MAX_WORST]
     return {

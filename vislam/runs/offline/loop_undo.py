@@ -1,7 +1,5 @@
 """The loop edges of a finished run: what became of each, and the run optimised again without some of them."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Sequence

@@ -1,15 +1,15 @@
 """A pose-graph file optimised and what its folder gets of it: the library's side of `vislam posegraph FILE`."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vislam.batch.posegraph.certificate import Certificate, certify
+from vislam.batch.posegraph.cholesky import Factor
 from vislam.batch.posegraph.domains import Team
 from vislam.batch.posegraph.files import read_pose_graph
 from vislam.batch.posegraph.g2o import write_g2o
@@ -17,11 +17,11 @@ from vislam.batch.posegraph.noise import NoiseOfKind, noise_of_kinds, rescaled
 from vislam.batch.posegraph.optimize import PoseGraphSolution, as_stated, optimize_pose_graph
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import Progress
-from vislam.batch.posegraph.uncertainty import Uncertainty
+from vislam.batch.posegraph.uncertainty import Uncertainty, uncertainty_if_any
 from vislam.config import PoseGraphConfig
 from vislam.core.collector import paused
 from vislam.core.errors import StorageError, UsageError
-from vislam.core.files import write_json, write_text
+from vislam.core.files import write_json, write_lines
 from vislam.core.geometry import quaternion_xyzw_from_rotation
 from vislam.core.messages import Array
 from vislam.trajectory import Trajectory, write_kitti, write_tum
@@ -40,6 +40,7 @@ class OptimizedGraph:
     summary: dict[str, Any]
     certificate: Certificate | None
     noise: tuple[NoiseOfKind, ...]  # what residuals show of the stated noise
+    uncertainty: Uncertainty | None  # None where nothing asked for it, or it cannot be had
 
 
 def optimize_graph_file(
@@ -53,11 +54,18 @@ def optimize_graph_file(
     begun = time.perf_counter()
     problem = read_pose_graph(path, config.repair_information, config.isam_noise)
     solution = optimize_pose_graph(problem, config, progress, team)
-    problem, solution, noise = _noise(problem, solution, config, progress)
-    certificate = None
+    noise: tuple[NoiseOfKind, ...] = ()
+    if config.rescale_noise:
+        problem, solution, noise = _rescaled(problem, solution, config, progress)
+    certificate, uncertainty, covariances = None, None, None
     if config.certify:
         solution, certificate = _certified(problem, solution)
-    covariances = Uncertainty(problem, solution.poses, solution.weights).of_all() if config.covariances else None
+    if config.covariances:
+        uncertainty = Uncertainty(problem, solution.poses, solution.weights)
+        covariances = uncertainty.of_all()
+    if config.noise and not config.rescale_noise:
+        uncertainty = uncertainty or uncertainty_if_any(problem, solution.poses, solution.weights)
+        noise = _noise(problem, solution, None if uncertainty is None else uncertainty.factor)
     make_folder(out)
     write_g2o(problem, out / "optimized.g2o", solution.poses)
     _write_trajectories(problem, solution.poses, out)
@@ -71,26 +79,24 @@ def optimize_graph_file(
     summary["certificate"] = None if certificate is None else certificate_entry(certificate)
     summary["wall_s"] = time.perf_counter() - begun
     write_json(out / "summary.json", summary)
-    return OptimizedGraph(problem, solution, summary, certificate, noise)
+    return OptimizedGraph(problem, solution, summary, certificate, noise, uncertainty)
 
 
-def _noise(
+def _noise(problem: PoseGraphProblem, solution: PoseGraphSolution, factor: Factor | None) -> tuple[NoiseOfKind, ...]:
+    """Return what residuals show of the stated noise; nothing where the factor does not fit."""
+    try:  # landmarks and priors are no odometry and no loops
+        return noise_of_kinds(problem, solution.poses, solution.weights, factor) if problem.of_poses else ()
+    except UsageError:
+        return ()
+
+
+def _rescaled(
     problem: PoseGraphProblem, solution: PoseGraphSolution, config: PoseGraphConfig, progress: Progress | None
 ) -> tuple[PoseGraphProblem, PoseGraphSolution, tuple[NoiseOfKind, ...]]:
-    """Return what residuals show of the stated noise; with `rescale_noise`, problem and solution rescaled by it."""
-    if not problem.of_poses:  # landmarks and priors are no odometry and no loops
-        if config.rescale_noise:
-            raise UsageError("--rescale-noise knows no landmarks and no priors, which this graph has; leave it away")
-        return problem, solution, ()
-    try:
-        wanted = config.noise or config.rescale_noise
-        noise = noise_of_kinds(problem, solution.poses, solution.weights) if wanted else ()
-    except UsageError:
-        if config.rescale_noise:
-            raise
-        return problem, solution, ()  # the factor does not fit: nothing is reported
-    if not config.rescale_noise:
-        return problem, solution, noise
+    """Return problem and solution rescaled by what residuals show of the stated noise, and what they then show."""
+    if not problem.of_poses:
+        raise UsageError("--rescale-noise knows no landmarks and no priors, which this graph has; leave it away")
+    noise = noise_of_kinds(problem, solution.poses, solution.weights)
     weights, applied = solution.weights, {kind.kind: 1.0 for kind in noise}
     for _ in range(_RESCALINGS):
         applied |= {k.kind: applied[k.kind] * k.factor for k in noise if np.isfinite(k.factor)}
@@ -178,8 +184,8 @@ def _write_trajectories(problem: PoseGraphProblem, poses: Array, out: Path) -> N
     T, ids = _in_space(problem, poses)[problem.is_pose], problem.ids[problem.is_pose]
     q = quaternion_xyzw_from_rotation(T[:, :3, :3])
     row = "%d," + ",".join(["%.15g"] * 7)
-    lines = [row % (i, *p, *o) for i, p, o in zip(ids.tolist(), T[:, :3, 3].tolist(), q.tolist(), strict=True)]
-    write_text(out / "poses.csv", "\n".join(["id,x_m,y_m,z_m,qx,qy,qz,qw", *lines]) + "\n")
+    lines = (row % (i, *p, *o) for i, p, o in zip(ids.tolist(), T[:, :3, 3].tolist(), q.tolist(), strict=True))
+    write_lines(out / "poses.csv", chain(["id,x_m,y_m,z_m,qx,qy,qz,qw"], lines))
     fits = int(ids.max(initial=0)) <= _MAX_ID_S
     stamps = (ids if fits else np.arange(len(ids))) * 1_000_000_000
     trajectory = Trajectory(stamps, T)
@@ -194,8 +200,8 @@ def _write_covariances(problem: PoseGraphProblem, covariances: Array, path: Path
     header = ",".join(["id", *(f"{axes[i]}_{axes[j]}" for i, j in zip(a, b, strict=True))])
     row = "%d," + ",".join(["%.9g"] * len(a))
     own = problem.is_pose
-    lines = [row % (i, *u) for i, u in zip(problem.ids[own].tolist(), covariances[own][:, a, b].tolist(), strict=True)]
-    write_text(path, "\n".join([header, *lines]) + "\n")
+    lines = (row % (i, *u) for i, u in zip(problem.ids[own].tolist(), covariances[own][:, a, b].tolist(), strict=True))
+    write_lines(path, chain([header], lines))
 
 
 def _write_landmarks(problem: PoseGraphProblem, poses: Array, covariances: Array | None, path: Path) -> None:
@@ -208,8 +214,8 @@ def _write_landmarks(problem: PoseGraphProblem, poses: Array, covariances: Array
         columns.append(covariances[at][:, -d:, -d:][:, a, b])
     row = "%d" + ",%.15g" * d + ",%.9g" * (len(header) - 1 - d)
     values = np.column_stack(columns).tolist()
-    lines = [row % (i, *v) for i, v in zip(problem.ids[at].tolist(), values, strict=True)]
-    write_text(path, "\n".join([",".join(header), *lines]) + "\n")
+    lines = (row % (i, *v) for i, v in zip(problem.ids[at].tolist(), values, strict=True))
+    write_lines(path, chain([",".join(header)], lines))
 
 
 @paused()
@@ -225,5 +231,5 @@ def _write_edges(problem: PoseGraphProblem, solution: PoseGraphSolution, path: P
         solution.weights.tolist(),
         strict=True,
     )
-    lines = [f"{a},{b},{before:.9g},{after:.9g},{kept:.0f}" for (a, b), before, after, kept in columns]
-    write_text(path, "\n".join(["from,to,chi2_before,chi2_after,kept", *lines]) + "\n")
+    lines = (f"{a},{b},{before:.9g},{after:.9g},{kept:.0f}" for (a, b), before, after, kept in columns)
+    write_lines(path, chain(["from,to,chi2_before,chi2_after,kept"], lines))

@@ -1,7 +1,5 @@
 """A finished run estimated again in batch, and what its folder gets of it: the library's side of `vislam optimize`."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Sequence

@@ -160,10 +160,13 @@ def _tracks(packets: list[KeyframePacket], rig: Rig, config: FrontEndConfig) -> 
     for i, packet in enumerate(packets):
         seen = packet.observations
         sides = [seen.pixels_px] if seen.right_px is None or not rig.is_stereo else [seen.pixels_px, seen.right_px]
-        for side, px in enumerate(sides):  # depth of a stereo pair is what its pixels say
-            depth = np.full(len(px), np.nan) if seen.depth_m is None or len(sides) > 1 else seen.depth_m
+        of_cameras = [(side, seen.track_ids, px) for side, px in enumerate(sides)]
+        of_cameras += [(further.camera, further.track_ids, further.pixels_px) for further in seen.further]
+        for side, track_ids, px in of_cameras:  # depth of a stereo pair is what its pixels say
+            is_deep = len(sides) == 1 and side == 0
+            depth = seen.depth_m if is_deep and seen.depth_m is not None else np.full(len(px), np.nan)
             image.append(np.full(len(px), i * len(rig.cameras) + side))
-            ids.append(seen.track_ids.astype(np.int64))
+            ids.append(track_ids.astype(np.int64))
             pixels.append(px.astype(np.float64))
             rho.append(1.0 / np.where(depth > 0.0, depth, np.nan))
     of_image, of_pixels, inverse = np.concatenate(image), np.concatenate(pixels), np.concatenate(rho)
@@ -175,7 +178,7 @@ def _tracks(packets: list[KeyframePacket], rig: Rig, config: FrontEndConfig) -> 
     there = np.isfinite(xy).all(axis=1) & np.isfinite(sigma)
     unique, point = np.unique(np.concatenate(ids)[there], return_inverse=True)
     tracks = Tracks(
-        of_image[there], point.astype(np.int64), xy[there], sigma[there], inverse[there],
+        of_image[there], of_image[there], point.astype(np.int64), xy[there], sigma[there], inverse[there],
         np.where(np.isfinite(inverse[there]), config.depth_sigma_rho, np.nan), np.zeros(there.sum()),
         np.zeros((there.sum(), 3)), len(unique),
     )  # fmt: skip

@@ -5,8 +5,6 @@ the keyframes' own. Settings that decide what is kept of an image (range limits,
 need the images: then the recording is read again, and only its keyframes are looked at.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A stored session as a part of a pose graph: keyframes, odometry and accepted loops, as its own graph had them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A vocabulary from images, recordings or ORB-SLAM's text file: the library's side of `vislam vocabulary`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Lengths are in tenths of a point, whole numbers, which keeps the text short. Col
 `var(--graph)` of its style sheet.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

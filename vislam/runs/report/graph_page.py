@@ -1,7 +1,5 @@
 """The report of an optimised pose graph: before and after, the cost, and what was found false."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +7,24 @@ import numpy as np
 from vislam.batch.posegraph.certificate import Certificate
 from vislam.batch.posegraph.optimize import PoseGraphSolution
 from vislam.batch.posegraph.problem import PoseGraphProblem
-from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses
-from vislam.core.errors import DataError, UsageError
+from vislam.batch.posegraph.uncertainty import Uncertainty, ellipses, uncertainty_if_any
 from vislam.core.files import write_text
 from vislam.core.messages import Array
 from vislam.runs.report.drawing import Axis, Lines, drawing
-from vislam.runs.report.html import bullets, card, escape, folded, grid, note, number, section, stylesheet, table, tile
+from vislam.runs.report.html import (
+    bullets,
+    card,
+    drawn,
+    escape,
+    folded,
+    grid,
+    note,
+    number,
+    section,
+    stylesheet,
+    table,
+    tile,
+)
 
 _MAX_LINES = 3000  # edges drawn of a picture: more cannot be seen and only makes the file heavy
 _REGIONS = 40  # poses whose uncertainty is drawn
@@ -28,11 +38,12 @@ def write_graph_report(
     path: Path,
     certificate: Certificate | None = None,
     stated: tuple[Array, float] | None = None,
+    uncertainty: Uncertainty | None = None,
 ) -> None:
     """Write report.html of an optimised pose graph. Raises StorageError.
 
     Where the problem came from a file, `stated` is what it states of the poses [N, d + 1, d + 1] and their cost, which
-    the page then shows as what was before; else it shows the start.
+    the page then shows as what was before; else it shows the start. `uncertainty`: the solution's, if it is known.
     """
     before, cost_before, of = (
         (solution.start, solution.costs[0], f"the {solution.start_name} start")
@@ -50,13 +61,14 @@ def write_graph_report(
         tile(number(len(solution.rejected), 0), "", "edges found false"),
         *([tile(certificate.word, "", "global optimum")] if certificate is not None else []),
     )
-    regions, enlarged = _regions(problem, solution)
+    uncertainty = uncertainty or uncertainty_if_any(problem, solution.poses, solution.weights)
+    regions, enlarged = (np.empty((0, 1, 2)), 1.0) if uncertainty is None else _regions(problem, solution, uncertainty)
     after = _picture(problem, solution, solution.poses, regions)
     times = "" if enlarged == 1.0 else f", {enlarged:g} times as large"
     title = f"After, with 95 % regions of some poses{times}" if len(regions) else "After"
     pictures = grid(
-        card(_picture(problem, solution, before), title=f"Before: {of}"),
-        card(after, title=title),
+        card(drawn(_picture(problem, solution, before)), title=f"Before: {of}"),
+        card(drawn(after), title=title),
     )
     starts = table(("start", "chi²"), [(k, f"{v:.6g}") for k, v in solution.start_costs.items()])
     body = "".join(
@@ -65,7 +77,8 @@ def write_graph_report(
             f'<div class="tiles">{"".join(tiles)}</div>',
             section("Trajectory", pictures),
             section(
-                "Cost", grid(card(_cost_curve(solution), title="chi² over iterations"), card(starts, title="Starts"))
+                "Cost",
+                grid(card(drawn(_cost_curve(solution)), title="chi² over iterations"), card(starts, title="Starts")),
             ),
             section("Certificate", note(escape(certificate.text))) if certificate is not None else "",
             _rejected(problem, solution),
@@ -88,14 +101,11 @@ def _plane(poses: Array) -> tuple[int, int]:
     return first, second
 
 
-def _regions(problem: PoseGraphProblem, solution: PoseGraphSolution) -> tuple[Array, float]:
-    """Return outlines [M, P, 2] of some poses' regions, none where they are undetermined, and how much enlarged."""
+def _regions(problem: PoseGraphProblem, solution: PoseGraphSolution, uncertainty: Uncertainty) -> tuple[Array, float]:
+    """Return outlines [M, P, 2] of some poses' regions, and how much enlarged."""
     step = max(1, len(problem.ids) // _REGIONS)
     chosen = np.flatnonzero(problem.is_pose | problem.is_point)[step // 2 :: step]
-    try:
-        covariances = Uncertainty(problem, solution.poses, solution.weights).of(problem.ids[chosen])
-    except (DataError, UsageError):  # undetermined, or too large a factor
-        return np.empty((0, 1, 2)), 1.0
+    covariances = uncertainty.of(problem.ids[chosen])
     axes = _plane(solution.poses)
     outlines = ellipses(solution.poses[chosen], covariances, axes=axes)
     extent = float(np.ptp(solution.poses[:, axes, problem.dimension], axis=0).max())

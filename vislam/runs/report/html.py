@@ -1,7 +1,5 @@
 """Small pieces of HTML: every text from outside is escaped here."""
 
-from __future__ import annotations
-
 import base64
 import html
 import math
@@ -14,6 +12,7 @@ from typing import Any
 from vislam.core.reading import read_bytes
 
 _MAX_PICTURE_PX = 1600
+_LETTERS_PX = 11.0  # the smallest that can be read on a phone
 _KEEP_BYTES = 400_000  # a smaller PNG stays one
 _MAX_PICTURE_BYTES = 64 * 2**20
 
@@ -65,7 +64,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]], text_column
     def kind(column: int) -> str:
         return "text" if column in text_columns else ""
 
-    lines = ["".join(f'<th class="{kind(k)}">{escape(name)}</th>' for k, name in enumerate(head))]
+    title = "".join(f'<th class="{kind(k)}">{escape(name)}</th>' for k, name in enumerate(head))
+    lines = []
     for row in rows:
         cells = []
         for k, value in enumerate(row):
@@ -73,7 +73,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str | Cell]], text_column
             dot = f'<i class="dot {escape(cell.mark)}"></i>' if cell.mark else ""
             cells.append(f'<td class="{cell.kind or kind(k)}">{dot}{escape(cell.text)}</td>')
         lines.append("".join(cells))
-    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f'<div class="scroll"><table><thead><tr>{title}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _text_of(value: str | Cell) -> str:
@@ -118,6 +119,14 @@ def bullets(lines: Sequence[str]) -> str:
 def preformatted(text: object) -> str:
     """Return text in fixed width."""
     return f"<pre>{escape(text)}</pre>"
+
+
+def drawn(svg: str) -> str:
+    """Return a drawing that keeps its letters readable: where there is no room it is moved under the finger."""
+    width = float(re.search(r'viewBox="0 0 ([\d.]+) ', svg)[1])  # type: ignore[index]  # each of ours has one
+    letters = min(map(float, re.findall(r'font-size(?:="|: ?)([\d.]+)', svg)), default=width)
+    least_px = math.ceil(_LETTERS_PX * width / letters)
+    return f'<div class="scroll"><div class="wide" style="min-width: {least_px}px">{svg}</div></div>'
 
 
 def folded(title: str, content: str) -> str:

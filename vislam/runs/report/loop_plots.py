@@ -1,7 +1,5 @@
 """Pictures of how good loops are: precision over recall per stage, and the errors of the edges."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,12 +1,11 @@
 """The report's section about loops: what became of each candidate, and how good they were against the truth."""
 
-from __future__ import annotations
-
+import math
 import re
 from collections import Counter
 
 from vislam.loop import LoopRow, caption
-from vislam.runs.report.html import Cell, card, escape, folded, grid, note, number, picture, section, table
+from vislam.runs.report.html import Cell, card, drawn, escape, folded, grid, note, number, picture, section, table
 from vislam.runs.report.run_files import RunFiles, as_dict
 from vislam.runs.report.scene import Scene
 
@@ -22,19 +21,24 @@ def loops_section(run: RunFiles, scene: Scene) -> str:
         return section("Loops", note("No candidates.")) if counts and run.has_camera else ""
     by_decision = Counter(loop.decision for loop in run.loops)
     summary = ", ".join(f"{by_decision[d]} {d}" for d in _DECISIONS if by_decision[d])
-    order = sorted(run.loops, key=lambda loop: (_rank(loop.decision), loop.to_id, loop.from_id))
+    order = sorted(run.loops, key=lambda loop: (_rank(loop.decision), -_moved(loop), loop.to_id, loop.from_id))
     head = [
         "from", "to", "at [s]", "decision", "reason", "source", "score", "inliers", "σ [m]", "in a row", "χ²", "weight",
         "moved [m]",
     ]  # fmt: skip
     rows = [_loop_row(loop, scene.zero_ns) for loop in order[:_MAX_LOOPS]]
     text = f"{len(run.loops)} candidates: {summary}."
-    shown = card(table(head, rows[:_SHOWN_LOOPS], text_columns=(3, 4, 5)))
+    shown = table(head, rows[:_SHOWN_LOOPS], text_columns=(3, 4, 5))
     rest = rows[_SHOWN_LOOPS:]
     hidden = len(order) - len(rows)
     title = f"{len(rest)} more candidates" + (f"; another {hidden} are in loops.csv" if hidden else "")
     more = folded(title, table(head, rest, text_columns=(3, 4, 5))) if rest else ""
-    return section("Loops", note(text), _loop_quality(run), _loop_pictures(run), _reasons(run.loops), shown, more)
+    words = note(
+        f"{text} “Moved” is a loop's own share of what the update that took it in moved. With scripts a click on a "
+        "heading sorts."
+    )
+    listed = f'<div class="sortable">{card(shown)}{more}</div>'
+    return section("Loops", words, _loop_quality(run), _loop_pictures(run), _reasons(run.loops), listed)
 
 
 def _loop_quality(run: RunFiles) -> str:
@@ -65,7 +69,7 @@ def _loop_quality(run: RunFiles) -> str:
         f"{number(edges.get('gross'), 0)} of {number(edges.get('accepted'), 0)} edges in the graph are off by more "
         f"than {number(rule.get('gross_m'), 1)} m or {number(rule.get('gross_deg'), 0)}°."
     )
-    return card(f'<div class="scroll wide">{figure}</div>', table(head, rows), title="Against the truth") + note(text)
+    return card(drawn(figure), table(head, rows), title="Against the truth") + note(text)
 
 
 def _loop_pictures(run: RunFiles) -> str:
@@ -109,6 +113,10 @@ def _reasons(loops: list[LoopRow]) -> str:
 
 def _few(pairs: list[str], most: int = 4) -> str:
     return "; ".join(pairs[:most]) + ("; …" if len(pairs) > most else "")
+
+
+def _moved(loop: LoopRow) -> float:
+    return loop.moved_max_m if math.isfinite(loop.moved_max_m) else 0.0
 
 
 def _rank(decision: str) -> int:

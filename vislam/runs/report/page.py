@@ -1,7 +1,5 @@
 """The report: one HTML file made from nothing but the files of a run folder."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
@@ -19,6 +17,7 @@ from vislam.runs.report.html import (
     Cell,
     bullets,
     card,
+    drawn,
     escape,
     folded,
     grid,
@@ -277,7 +276,7 @@ def _trajectories(run: RunFiles, scene: Scene) -> str:
     above, aside = _views(run, scene)
     if not above:
         return ""
-    views = grid(card(above, title="From above"), card(aside, title="From the side"))
+    views = grid(card(drawn(above), title="From above", kind="from-above"), card(drawn(aside), title="From the side"))
     tilted = not scene.has_gravity and scene.truth is None and not as_dict(run.metrics, "up").get("direction")
     text = "There is no IMU to show what is up: z is that of the first camera." if tilted else ""
     return section("Trajectories", views, note(text) if text else "", kind="still of-map")
@@ -295,7 +294,7 @@ def _over_time(run: RunFiles, scene: Scene) -> str:
         return ""
     text = "Green strokes are accepted loops. State: green ok, yellow degraded, red lost."
     words = note(text) if run.has_camera else ""
-    return section("Over time", card(f'<div class="scroll wide">{figure}</div>'), words, kind="still")
+    return section("Over time", card(drawn(figure)), words, kind="still")
 
 
 def _map(run: RunFiles) -> str:
@@ -345,7 +344,7 @@ def _timing(run: RunFiles) -> str:
             [name, *quantiles, number(stage.get("count"), 0), number(stage.get("total_s"), 2), percent(share, 0)]
         )
     head = ["stage", "p50 [ms]", "p95", "p99", "calls", "total [s]", "share"]
-    return section("Time", grid(card(figure) if figure else "", card(table(head, rows))), _cost(run))
+    return section("Time", grid(card(drawn(figure)) if figure else "", card(table(head, rows))), _cost(run))
 
 
 def _cost(run: RunFiles) -> str:
@@ -376,7 +375,7 @@ def _biases(run: RunFiles, scene: Scene) -> str:
     if figures is None:
         return ""
     text = "Solid: graph with ±3σ. Dashed: EKF."
-    return section("Inertial biases", grid(*map(card, figures)), note(text))
+    return section("Inertial biases", grid(*(card(drawn(figure)) for figure in figures)), note(text))
 
 
 def _lost(run: RunFiles) -> str:

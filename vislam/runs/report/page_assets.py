@@ -1,7 +1,5 @@
 """What pages carry: files of the folder `assets`, and arrays as text."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 from typing import Any

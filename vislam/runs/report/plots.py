@@ -1,7 +1,5 @@
 """The report's pictures as inline SVG that follows the page's colours, light or dark."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

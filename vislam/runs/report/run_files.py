@@ -1,7 +1,5 @@
 """What is in a run folder, read leniently: a file that is absent or damaged becomes a reason, not an error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

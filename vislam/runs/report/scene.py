@@ -1,7 +1,5 @@
 """The trajectories of a run brought into one frame for drawing, with their errors against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

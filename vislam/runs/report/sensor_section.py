@@ -1,7 +1,5 @@
 """The report's section about further sensors: what became of their readings, and what their own variables are."""
 
-from __future__ import annotations
-
 from vislam.runs.report.html import Cell, card, note, number, section, table
 from vislam.runs.report.run_files import RunFiles, as_dict, as_list
 

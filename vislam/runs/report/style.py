@@ -1,7 +1,5 @@
 """How pictures look: inline SVG that follows the page's colours, light or dark."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import re

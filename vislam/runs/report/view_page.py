@@ -1,7 +1,5 @@
 """The interactive part of a report: its elements, style and scripts, all inside the one file."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re
@@ -12,7 +10,7 @@ from vislam.runs.report.page_assets import assets
 from vislam.runs.report.view_data import as_script
 
 # each may use those before it
-_MODULES = ("data.js", "view.js", "layers.js", "plots.js", "details.js", "labels.js", "main.js")
+_MODULES = ("data.js", "view.js", "layers.js", "plots.js", "details.js", "labels.js", "sort.js", "main.js")
 _LIBRARIES = ("vendor/three.min.js", "vendor/uplot.min.js")
 
 

@@ -1,7 +1,5 @@
 """Checksums of a session's records, and its soundness: SQLite itself notices no flipped bit in what it stores."""
 
-from __future__ import annotations
-
 import math
 import sqlite3
 import struct
@@ -14,6 +12,7 @@ from typing import Any
 from vislam.core.errors import DataError
 from vislam.runs.session.schema import (
     APPLICATION_ID,
+    FIRST_WITH_FURTHER,
     FIRST_WITH_LABELS,
     FIRST_WITH_MOTIONS,
     FIRST_WITH_READINGS,
@@ -40,13 +39,13 @@ _COVERED: dict[str, tuple[tuple[int, ...], ...]] = {
     "vocabulary": (tuple(range(4)),),
     "newest": ((0, 1),),
 }
-_COVERED_READINGS: dict[str, tuple[tuple[int, ...], ...]] = {
-    "readings": (tuple(range(7)),),
-    "own_starts": (tuple(range(5)),),
+_COVERED_LATER: dict[int, dict[str, tuple[tuple[int, ...], ...]]] = {  # by the format that has the tables first
+    FIRST_WITH_READINGS: {"readings": (tuple(range(7)),), "own_starts": (tuple(range(5)),)},
+    FIRST_WITH_LABELS: {"labels": (tuple(range(2)),)},
+    FIRST_WITH_MOTIONS: {"motions": (tuple(range(2)),)},
+    FIRST_WITH_FURTHER: {"further": (tuple(range(4)),)},
 }
-_COVERED_LABELS: dict[str, tuple[tuple[int, ...], ...]] = {"labels": (tuple(range(2)),)}
-_COVERED_MOTIONS: dict[str, tuple[tuple[int, ...], ...]] = {"motions": (tuple(range(2)),)}
-_COVERED_ALL = _COVERED | _COVERED_READINGS | _COVERED_LABELS | _COVERED_MOTIONS
+_COVERED_ALL = _COVERED | {table: columns for tables in _COVERED_LATER.values() for table, columns in tables.items()}
 _EXACT = 2**53  # whole numbers below are the same to SQLite, whether they were given as int or as float
 
 
@@ -79,10 +78,8 @@ def check_sound(db: sqlite3.Connection, path: Path) -> None:
 def check_records(db: sqlite3.Connection, path: Path) -> None:
     """Raise DataError unless every record is what was written."""
     with readable(path):
-        tables = _COVERED | (_COVERED_READINGS if has_readings(db) else {})
-        tables |= _COVERED_LABELS if has_labels(db) else {}
-        tables |= _COVERED_MOTIONS if has_motions(db) else {}
-        for table, covered in tables.items():
+        later = [tables for first, tables in _COVERED_LATER.items() if is_since(db, first)]
+        for table, covered in [pair for tables in (_COVERED, *later) for pair in tables.items()]:
             for number, row in enumerate(db.execute(f"SELECT * FROM {table}")):
                 count = len(row) - len(covered)
                 if checksums(table, row[:count]) != row[count:]:
@@ -92,19 +89,9 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
                     )
 
 
-def has_readings(db: sqlite3.Connection) -> bool:
-    """Return whether a session has the tables of readings of other sensors: not one of an older format."""
-    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_READINGS)
-
-
-def has_labels(db: sqlite3.Connection) -> bool:
-    """Return whether a session has the table of labels: not one of an older format."""
-    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_LABELS)
-
-
-def has_motions(db: sqlite3.Connection) -> bool:
-    """Return whether a session has the table of the filter's motion at frames: not one of an older format."""
-    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= FIRST_WITH_MOTIONS)
+def is_since(db: sqlite3.Connection, first: int) -> bool:
+    """Return whether a session has the tables that format `first` brought: it is not of an older one."""
+    return bool(db.execute("PRAGMA user_version").fetchone()[0] >= first)
 
 
 def check_version(db: sqlite3.Connection, path: Path) -> int:

@@ -1,14 +1,14 @@
 """Keyframe packets as rows of a session: all but images and features."""
 
-from __future__ import annotations
-
 import math
+import sqlite3
 from typing import Any
 
 import numpy as np
 
 from vislam.core.messages import (
     Frame,
+    FurtherTracks,
     ImuSpan,
     Keyframe,
     KeyframePacket,
@@ -69,3 +69,22 @@ def packet_of(t_ns: int, row: tuple[Any, ...]) -> KeyframePacket:
     features = np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
     keyframe = Keyframe(row[0], t_ns, Frame(t_ns, row[0], ()), *features, None)
     return KeyframePacket(keyframe, vo, observations, imu, mag, bool(row[18]), float(row[19]), bool(row[20]))
+
+
+def further_rows(packet: KeyframePacket) -> list[tuple[Any, ...]]:
+    """Return the rows of what cameras beyond the first pair saw."""
+    return [
+        (packet.keyframe.id, seen.camera, to_bytes(seen.track_ids, "<i8"), to_bytes(seen.pixels_px, "<f4"))
+        for seen in packet.observations.further
+    ]
+
+
+def further_of(db: sqlite3.Connection) -> dict[int, tuple[FurtherTracks, ...]]:
+    """Return all of it by keyframe; ValueError or TypeError on damage."""
+    out: dict[int, tuple[FurtherTracks, ...]] = {}
+    query = "SELECT id, camera, track_ids, pixels_px FROM further ORDER BY id, camera"
+    for k, camera, ids, pixels in db.execute(query):
+        found = integers(ids)
+        seen = FurtherTracks(int(camera), found, numbers(pixels, "<f4", (len(found), 2)))
+        out[k] = (*out.get(k, ()), seen)
+    return out

@@ -1,7 +1,5 @@
 """Reading a session; it is never written here."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -29,11 +27,15 @@ from vislam.core.messages import (
     Tracking,
 )
 from vislam.factors import FactorLog, LoggedEdge, LoggedKeyframe, rig_from, state_from
-from vislam.runs.session.checks import check_records, check_sound, has_labels, has_motions, has_readings
-from vislam.runs.session.packets import LIGHT_COLUMNS, packet_of
+from vislam.runs.session.checks import check_records, check_sound, is_since
+from vislam.runs.session.packets import LIGHT_COLUMNS, further_of, packet_of
 from vislam.runs.session.reading_rows import readings_of, starts_of
 from vislam.runs.session.schema import (
     DESCRIPTOR_BYTES,
+    FIRST_WITH_FURTHER,
+    FIRST_WITH_LABELS,
+    FIRST_WITH_MOTIONS,
+    FIRST_WITH_READINGS,
     from_bytes,
     maybe_numbers,
     noise_of,
@@ -216,7 +218,7 @@ class Session:
         """Return what the map keeps of keyframes, by their ids."""
         rows = self.rows("SELECT id, t_ns, depth_png, points, colors FROM scans ORDER BY id")
         scans = {i: PackedScan(*row) for i, *row in rows}
-        if not has_labels(self._db):
+        if not is_since(self._db, FIRST_WITH_LABELS):
             return scans
         labels = dict(self.rows("SELECT id, png FROM labels"))
         return {i: replace(scan, labels_png=labels[i]) if i in labels else scan for i, scan in scans.items()}
@@ -253,7 +255,7 @@ class Session:
             ]
 
     def _motion_rows(self) -> Iterable[tuple[int, bytes]]:
-        return self._db.execute("SELECT t_ns, numbers FROM motions") if has_motions(self._db) else ()
+        return self._db.execute("SELECT t_ns, numbers FROM motions") if is_since(self._db, FIRST_WITH_MOTIONS) else ()
 
     def states(self, whose: str) -> dict[int, NavState]:
         """Return the stored states of keyframes: of the "filter" in odom, or of the "graph"."""
@@ -274,11 +276,21 @@ class Session:
                 out.append(packet_of(t_ns, tuple(row)))
             if len(out) != count:
                 raise ValueError(f"{count} keyframes but {len(out)} packets")
-            return self._with_readings(out)
+            return self._with_readings(out if light else self._with_further(out))
+
+    def _with_further(self, packets: list[KeyframePacket]) -> list[KeyframePacket]:
+        """Return the packets with what cameras beyond the first pair saw, of which older formats know nothing."""
+        if not is_since(self._db, FIRST_WITH_FURTHER):
+            return packets
+        for k, seen in further_of(self._db).items():
+            if k not in range(len(packets)):
+                raise ValueError(f"tracks of keyframe {k}, which is not there")
+            packets[k] = replace(packets[k], observations=replace(packets[k].observations, further=seen))
+        return packets
 
     def _with_readings(self, packets: list[KeyframePacket]) -> list[KeyframePacket]:
         """Return the packets with what other sensors said; a session of an older format knows nothing of it."""
-        if not has_readings(self._db):
+        if not is_since(self._db, FIRST_WITH_READINGS):
             return packets
         readings, starts = readings_of(self._db), starts_of(self._db)
         for k in readings.keys() | starts.keys():

@@ -1,7 +1,5 @@
 """Readings of other sensors, and where their own variables began, as rows of a session."""
 
-from __future__ import annotations
-
 import math
 import sqlite3
 from collections.abc import Iterable

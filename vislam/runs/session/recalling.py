@@ -1,12 +1,13 @@
 """A session as the memory that a pipeline goes on from."""
 
-from __future__ import annotations
-
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vislam.core import collector
+from vislam.core.errors import DataError
 from vislam.core.geometry import are_rigid
 from vislam.core.memory import (
     FrontMemory,
@@ -29,6 +30,24 @@ from vislam.runs.session.schema import maybe_numbers, noise_of, numbers, readabl
 _RIGID = 1e-4  # how far R R^T may be from identity
 
 
+def can_go_on(path: Path) -> bool:
+    """Return whether a session file holds something to go on from, as `recall` has it; False for a damaged one."""
+    try:
+        with closing(Session(path)) as session:
+            return _has_keyframe(session)
+    except DataError:
+        return False
+
+
+def _has_keyframe(session: Session) -> bool:
+    info, newest = session.info(), session.newest()
+    with readable(session.path):
+        if not newest or (_start(info) is None and info["imu_noise"] is not None):
+            return False
+        count = next(session.rows("SELECT COUNT(*) FROM keyframes"))[0]
+        return bool(count > (info.get("map") or {}).get("keyframes", 0))
+
+
 @collector.paused()
 def recall(session: Session) -> SlamMemory | None:
     """Return what a pipeline goes on from; None when the session has nothing worth going on from.
@@ -38,12 +57,10 @@ def recall(session: Session) -> SlamMemory | None:
     """
     info, newest = session.info(), session.newest()
     with readable(session.path):
+        if not _has_keyframe(session):
+            return None
         start, base = _start(info), info.get("map") or {}
-        if not newest or (start is None and info["imu_noise"] is not None):
-            return None
         stored = list(session.keyframes())
-        if len(stored) <= base.get("keyframes", 0):
-            return None
         packets = session.packets(light=True)
         states = session.states("graph")
         loops = session.loops()

@@ -1,7 +1,5 @@
 """The tables of a session, and values as the bytes in them."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +15,9 @@ from vislam.core.memory import EdgeRecord, GravityRecord, WindowRecord
 from vislam.core.messages import Array, NavState
 
 APPLICATION_ID = 0x5649534C  # "VISL": distinguishes our files from other SQLite files
-SCHEMA_VERSION = 11
+SCHEMA_VERSION = 12
 OLDEST_VERSION = 8  # read as well; it knows nothing of what `_LATER` holds
-FIRST_WITH_READINGS, FIRST_WITH_LABELS, FIRST_WITH_MOTIONS = 9, 10, 11
+FIRST_WITH_READINGS, FIRST_WITH_LABELS, FIRST_WITH_MOTIONS, FIRST_WITH_FURTHER = 9, 10, 11, 12
 DESCRIPTOR_BYTES = 32
 _MAX_BLOB_BYTES = 64 * 2**20  # no keyframe of ours comes near; a larger one is damage
 _STATE_NUMBERS = 250
@@ -113,7 +111,16 @@ CREATE TABLE labels (id INTEGER PRIMARY KEY, png BLOB NOT NULL, crc INTEGER NOT 
 _MOTIONS = """
 CREATE TABLE motions (t_ns INTEGER PRIMARY KEY, numbers BLOB NOT NULL, crc INTEGER NOT NULL);
 """
-_LATER = ((FIRST_WITH_READINGS, _READINGS), (FIRST_WITH_LABELS, _LABELS), (FIRST_WITH_MOTIONS, _MOTIONS))
+_FURTHER = """
+CREATE TABLE further (
+    id INTEGER NOT NULL, camera INTEGER NOT NULL, track_ids BLOB NOT NULL, pixels_px BLOB NOT NULL,
+    crc INTEGER NOT NULL, PRIMARY KEY (id, camera)
+);
+"""
+_LATER = (
+    (FIRST_WITH_READINGS, _READINGS), (FIRST_WITH_LABELS, _LABELS), (FIRST_WITH_MOTIONS, _MOTIONS),
+    (FIRST_WITH_FURTHER, _FURTHER),
+)  # fmt: skip
 
 
 def schema(version: int) -> str:

@@ -29,7 +29,7 @@ from vislam.core.up import Up
 from vislam.factors import rig_data, state_data
 from vislam.imu import ImuNoise
 from vislam.runs.session.checks import check_records, check_sound, checksum, checksums
-from vislam.runs.session.packets import packet_row
+from vislam.runs.session.packets import further_rows, packet_row
 from vislam.runs.session.reader import Session
 from vislam.runs.session.reading_rows import own_data, reading_rows, start_rows
 from vislam.runs.session.schema import (
@@ -44,6 +44,8 @@ from vislam.runs.session.schema import (
     to_bytes,
     window_bytes,
 )
+
+_ROWS_OF_PACKETS = {"further": further_rows, "readings": reading_rows, "own_starts": start_rows}
 
 
 class SessionWriter:
@@ -200,8 +202,8 @@ class SessionWriter:
                 self._set_info({"start": _start_data(entry.start)})
             self._insert("keyframes", [row])
             self._insert("packets", [packet_row(packet, update.newest)])
-            self._insert("readings", reading_rows(packet))
-            self._insert("own_starts", start_rows(packet))
+            for table, rows in _ROWS_OF_PACKETS.items():
+                self._insert(table, rows(packet))
             if entry.filter_state is not None:
                 self._put_states("filter", [(keyframe.id, entry.filter_state)])
             scans = entry.scans.items()

@@ -4,8 +4,6 @@ An estimator that fuses both hides where they disagree in its biases and residua
 steps between keyframes by least squares, with the few unknowns that a wrong calibration would show in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """From evidence to a verdict: trusted, doubtful with reasons, or lost. Pure: the same evidence, the same verdict."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -175,10 +173,9 @@ def _start(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     elif not e.is_confirmed:
         yield "the start was not confirmed before the end: scale may err by more than its sigma; go on longer"
     if e.scale_sigma > _SCALE_SIGMA:
-        yield (
-            f"one camera's metres are known to {100.0 * e.scale_sigma:.1f} % (1 sigma) only: move with more changes of "
-            "speed, or use a second camera or depth"
-        )
+        known = f"known to {100.0 * e.scale_sigma:.1f} % (1 sigma) only"
+        known = known if math.isfinite(e.scale_sigma) else "not known yet"
+        yield f"one camera's metres are {known}: move with more changes of speed, or use a second camera or depth"
 
 
 def _filter(e: Evidence, c: VerdictConfig) -> Iterator[str]:
@@ -257,12 +254,8 @@ def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
             f"the accelerometer's metres are {_percent(forces.scale - 1.0)} than those of vision: check baseline or "
             "depth scale, and calibrate the accelerometer"
         )
-    if _beyond(
-        Moved(forces.gravity_m_s2 - e.gravity_m_s2, forces.gravity_sigma_m_s2),
-        _FORCE_SCALE_SIGMA * e.gravity_m_s2,
-        1,
-        c,
-    ):
+    gravity = Moved(forces.gravity_m_s2 - e.gravity_m_s2, forces.gravity_sigma_m_s2)
+    if _beyond(gravity, _FORCE_SCALE_SIGMA * e.gravity_m_s2, 1, c):
         yield f"gravity along the way is {forces.gravity_m_s2:.2f} m/s2: calibrate the accelerometer"
 
 

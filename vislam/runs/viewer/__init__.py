@@ -34,9 +34,9 @@ __all__ = ["NullViewer", "open_viewer"]
 class NullViewer:
     """The viewer of a run that is not watched: every method of RunViewer, doing nothing."""
 
-    def __init__(self, reason: str = "off") -> None:
-        """Remember why there is no viewer, so that a run can say it."""
-        self.reason = reason
+    def __init__(self, missing: str | None = None) -> None:
+        """Remember what is missing, so that a run can say it; None: nothing, it is off."""
+        self._missing = missing
 
     def go_on(self, zero_ns: int, T_map_body: Mapping[int, Array]) -> None:
         """Ignore where an earlier recording ended."""
@@ -87,8 +87,9 @@ class NullViewer:
         """Ignore a note."""
 
     def close(self) -> str | None:
-        """Return None: nothing is missing."""
-        return None
+        """Return what is missing, once; None: nothing is."""
+        missing, self._missing = self._missing, None
+        return missing
 
     def __enter__(self) -> NullViewer:
         return self
@@ -111,5 +112,5 @@ def open_viewer(
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] not in ("rerun", "rerun_bindings"):
             raise
-        return NullViewer(f"rerun-sdk, which writes run.rrd, is not installed; {install_line('view')}")
+        return NullViewer(f"run.rrd is left out: rerun-sdk is not installed; {install_line('view')}")
     return RunViewer(path, rig, config or ViewConfig())

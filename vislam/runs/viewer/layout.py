@@ -1,7 +1,5 @@
 """How Rerun arranges its views of a run."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import rerun.blueprint as rrb

@@ -3,8 +3,6 @@
 Both are sparse voxels of 16 bytes each, in a bounded number: larger maps are shown coarser.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A fix as a reading of `position`: which are good enough, how sure they are, and where the local frame begins."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

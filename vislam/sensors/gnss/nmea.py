@@ -1,7 +1,5 @@
 """Fixes from lines of NMEA 0183: GGA for the place, RMC for the date, GST for how sure it is."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from datetime import date, timedelta

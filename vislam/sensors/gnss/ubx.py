@@ -1,7 +1,5 @@
 """Fixes from u-blox's binary messages: NAV-PVT; all others are passed over."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from datetime import date

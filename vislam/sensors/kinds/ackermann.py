@@ -1,7 +1,5 @@
 """Speed and steering angle of a car."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Ranges to anchors, as ultra-wide band measures them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What all that drives shares: a base that goes forward, not sideways and not up, and turns as the gyroscope has it."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import NamedTuple
 

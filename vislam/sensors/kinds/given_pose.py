@@ -1,7 +1,5 @@
 """Poses from elsewhere: motion capture, tags at known places, another SLAM, an odometry of its own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Headings about up: a compass that was calibrated elsewhere, two antennas, a sun sensor."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

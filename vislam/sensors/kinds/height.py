@@ -1,7 +1,5 @@
 """Heights, as a barometer measures them: good from minute to minute, with an offset that walks with the weather."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

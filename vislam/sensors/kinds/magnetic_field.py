@@ -1,7 +1,5 @@
 """The magnetometer of the machine: the direction of a field that is the same wherever the body goes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

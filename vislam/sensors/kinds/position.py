@@ -1,7 +1,5 @@
 """Positions in a local level frame: GNSS turned into east, north, up, a total station, ultrasound."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

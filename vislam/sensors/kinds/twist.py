@@ -1,7 +1,5 @@
 """Velocities of another odometry in the base's axes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Speeds of two wheels, or two tracks, that steer by their difference."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

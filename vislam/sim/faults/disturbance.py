@@ -1,7 +1,5 @@
 """What spoils vision: a view without texture, light that jumps, a person who fills part of the image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -4,8 +4,6 @@ Rotors and wheels shake an IMU at tens of hertz and more. No model of white nois
 rest or in the hand does not have it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from fractions import Fraction
 

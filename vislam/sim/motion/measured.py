@@ -11,8 +11,6 @@ The world of a motion capture is never quite level (half a degree in EuRoC's V2_
 accelerometer shows how much, and the world is turned upright.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, make_interp_spline, make_lsq_spline

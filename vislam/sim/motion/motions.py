@@ -1,7 +1,5 @@
 """Motions for simulated vision that no rendered world has: those in which estimators go wrong, and one without end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

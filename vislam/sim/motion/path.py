@@ -1,7 +1,5 @@
 """How worlds describe where a body goes: rounded polylines, travel with rests and pauses, smooth random motion."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How a person who carries the camera walks along a path: with bob, sway and a wandering gaze."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

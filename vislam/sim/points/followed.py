@@ -5,8 +5,6 @@ another landmark and stay there, some jump for a single frame, some are not foun
 the image: a part of it in which everything moves together, but not as the world does.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -64,13 +62,14 @@ class SimulatedTracker:
     """Follows landmarks from frame to frame; call `see` in order of time."""
 
     def __init__(
-        self, rig: Rig, field: LandmarkField, motion: Moves, noise: TrackNoise, rng: np.random.Generator
-    ) -> None:
-        """Start without tracks."""
+        self, rig: Rig, field: LandmarkField, motion: Moves, noise: TrackNoise, rng: np.random.Generator,
+        first_id: int = 0,
+    ) -> None:  # fmt: skip
+        """Start without tracks; ids count from `first_id` on."""
         self._rig, self._field, self._motion, self._noise, self._rng = rig, field, motion, noise, rng
         self._surroundings = Surroundings(field)
         self._depth_noise = DepthNoise()
-        self._next_id = 0
+        self._next_id = first_id
         self._last_s: float | None = None
         self._T_world_cam: Array = np.eye(4)  # at that time
         self._visible: tuple[Ids, Array] | None = None  # landmarks that could be seen then, and where; when asked for

@@ -1,7 +1,5 @@
 """Landmarks without images: points scattered around a path, so that a camera on it sees some wherever it looks."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree

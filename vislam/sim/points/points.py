@@ -9,40 +9,121 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from vislam.config import validated
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, UsageError
-from vislam.core.messages import Array, Frame, ImuSample, Observations
+from vislam.core.geometry import so3_exp, transform
+from vislam.core.messages import Array, Frame, FurtherTracks, ImuSample, Observations
 from vislam.imu import ImuNoise
 from vislam.sim.faults.disturbance import in_window
-from vislam.sim.inertial_source import InertialSource, RecordedImu, SimulatedImu
 from vislam.sim.motion.measured import MeasuredMotion
 from vislam.sim.motion.motions import POINT_WORLDS, vi_sensor_rig, world_motion, world_rig
+from vislam.sim.motion.spline import BodySpline
 from vislam.sim.points.followed import Moves, SimulatedTracker, TrackNoise
 from vislam.sim.points.landmark_field import LandmarkField
-from vislam.sim.sensing import CONSUMER_IMU
+from vislam.sim.sensing import CONSUMER_IMU, sense_imu
 from vislam.sim.worlds.simulation import TrueStates
-from vislam.sim.worlds.table import WORLDS
+from vislam.sim.worlds.table import WORLDS, surrounded
 from vislam.trajectory import Trajectory
 from vislam.trajectory.truth_fit import TruthFit
 
 Stamps = NDArray[np.int64]
 _Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 _Seconds = Annotated[float, Field(ge=0.0)]
-
 _WORLD_ZERO_NS = 1_000_000_000_000
 _MARGIN_S = 0.05  # frames keep this distance from the ends of the motion
 _TRUTH_STEP_S = 0.01  # so dense that a straight line between poses is exact enough
 _PATH_STEP_S = 0.1  # of the path around which landmarks are placed
 _AXIS = np.array([0.6, -0.64, 0.48])  # about which stated and true extrinsics differ, in the camera's axes
+_ID_BITS = 40  # of a track, below its camera
 _AT_ONCE = 2000  # poses evaluated in one go
+_CHUNK = 4000  # samples made at once
+
+
+class InertialSource(Protocol):
+    """Inertial samples in time order, and the biases in them."""
+
+    def samples(self) -> Iterator[ImuSample]:
+        """Yield the samples; can be called again and yields the same again."""
+        ...
+
+    def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
+        """Return gyro and accelerometer biases [N, 3] at times [N]; NaN where they are unknown."""
+        ...
+
+
+class RecordedImu:
+    """The samples of a recording between two stamps, and the next one on either side."""
+
+    def __init__(self, t_ns: Stamps, gyro_rad_s: Array, accel_m_s2: Array, begin_ns: int, end_ns: int) -> None:
+        """Take samples at times [N], gyro and accel [N, 3]."""
+        first = max(int(np.searchsorted(t_ns, begin_ns, "right")) - 1, 0)
+        used = slice(first, int(np.searchsorted(t_ns, end_ns)) + 1)
+        self._t_ns, self._gyro, self._accel = t_ns[used], gyro_rad_s[used], accel_m_s2[used]
+
+    def samples(self) -> Iterator[ImuSample]:
+        """Yield the samples."""
+        for t_ns, gyro, accel in zip(self._t_ns.tolist(), self._gyro, self._accel, strict=True):
+            yield ImuSample(t_ns, gyro, accel)
+
+    def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
+        """Return NaN: they are unknown of a real IMU."""
+        return np.full((len(t_ns), 3), np.nan), np.full((len(t_ns), 3), np.nan)
+
+
+class SimulatedImu:
+    """A simulated IMU on a spline; the samples are made in pieces, so that an hour needs little memory."""
+
+    def __init__(
+        self,
+        motion: BodySpline,
+        zero_ns: int,
+        span_s: tuple[float, float],
+        noise: ImuNoise,
+        gravity_m_s2: float,
+        seed: np.random.SeedSequence,
+        disturbed: bool,
+    ) -> None:
+        """Sense a motion over a span of its seconds; `zero_ns` is the stamp of second 0. See `sense_imu`."""
+        self._motion, self._zero_ns, self._noise, self._gravity = motion, zero_ns, noise, gravity_m_s2
+        self._disturbed = disturbed
+        count = int(np.floor((span_s[1] - span_s[0]) * noise.rate_hz + 1e-9)) + 1
+        self._t_ns: Stamps = np.round((span_s[0] + np.arange(count) / noise.rate_hz) * 1e9).astype(np.int64)
+        self._seeds = seed.spawn(-(-count // _CHUNK))
+
+    def samples(self) -> Iterator[ImuSample]:
+        """Yield the samples."""
+        for t_ns, values in self._pieces():
+            for t, row in zip((t_ns + self._zero_ns).tolist(), values, strict=True):
+                yield ImuSample(t, row[:3], row[3:6])
+
+    def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
+        """Return the biases in the samples, interpolated."""
+        known = np.concatenate([values[:, 6:] for _, values in self._pieces()])
+        columns = [np.interp(t_ns - self._zero_ns, self._t_ns, column) for column in known.T]
+        return np.stack(columns[:3], axis=1), np.stack(columns[3:], axis=1)
+
+    def _pieces(self) -> Iterator[tuple[Stamps, Array]]:
+        """Yield times [n] and gyro, accel, gyro bias, accel bias [n, 12]; biases walk on from piece to piece."""
+        last: Array | None = None
+        for index, seed in enumerate(self._seeds):
+            t_ns = self._t_ns[index * _CHUNK : (index + 1) * _CHUNK]
+            rng = np.random.default_rng(seed)
+            motion = self._motion.at(t_ns.astype(np.float64) * 1e-9)
+            record = sense_imu(motion, self._noise, self._gravity, rng, self._disturbed)
+            biases = np.hstack([record.gyro_bias_rad_s, record.accel_bias_m_s2])
+            # every piece has a turn-on value of its own: only that of the first one counts
+            shift = np.zeros(6) if last is None else last - biases[0]
+            values = np.hstack([record.gyro_rad_s, record.accel_m_s2]) + shift
+            biases = biases + shift
+            last = biases[-1]
+            yield t_ns, np.hstack([values, biases])
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +131,7 @@ class PointOptions:
     """What can be chosen about simulated vision; times count from the first frame."""
 
     rig: Literal["mono", "stereo", "rgbd", "none"] = "stereo"  # none: no camera
+    further_cameras: Annotated[int, Field(ge=0, le=6)] = 0  # beside those, evenly around the vertical
     start_s: _Seconds = 0.0  # into the recording or motion
     duration_s: Annotated[float, Field(ge=0.5)] | None = None  # None: all there is; for point worlds their usual
     camera_hz: Annotated[float, Field(gt=0.1, le=120.0)] = 20.0
@@ -62,7 +144,7 @@ class PointOptions:
     distortion: bool = True  # of the lenses
     descriptors: bool = True  # that recognise a landmark when it is seen again; without, no loops
     lost_share: _Share = 0.0  # of the frames: they never arrive
-    outage_begin_s: _Seconds = 0.0  # frames without a single track ...
+    outage_begin_s: _Seconds = 0.0  # frames without a single track of the first camera, or pair ...
     outage_length_s: _Seconds = 0.0  # ... for so long ...
     outage_every_s: _Seconds = 0.0  # ... and again after so long; 0: once
     moving_share: _Share = 0.0  # of the image: filled by a person who walks to and fro
@@ -180,11 +262,11 @@ class PointRecording:
             return
         count = 2 if options.rig == "stereo" else 1
         self.true_rig = Rig(cameras[:count], base.T_body_cams[:count], has_depth=options.rig == "rgbd")
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(_AXIS * np.deg2rad(options.extrinsic_rotation_deg)).as_matrix()
-        first = base.T_body_cams[0] @ turn
-        given = (first, first @ base.T_cam0_cam1) if count == 2 else (first,)
-        self.rig = Rig(cameras[:count], given, has_depth=options.rig == "rgbd")
+        self.true_rig = surrounded(self.true_rig, options.further_cameras)
+        turn = so3_exp(_AXIS * np.deg2rad(options.extrinsic_rotation_deg))
+        first = base.T_body_cams[0] @ transform(turn, np.zeros(3))
+        given = tuple(first @ T for T in self.true_rig.T_cam0_cams[1:])
+        self.rig = Rig(self.true_rig.cameras, (first, *given), self.true_rig.has_depth)
 
     def _frame_times(self) -> Array:
         shutter_s = 0.5 * self.options.readout_s
@@ -211,19 +293,23 @@ class PointRecording:
             streams.append(self._frames())
         yield from heapq.merge(*streams, key=lambda event: event.t_ns)
 
-    def tracker(self) -> SimulatedTracker:
-        """Return the tracker that makes the frames, at its beginning; for tests that want to know the truth."""
-        options = self.options
+    def tracker(self, camera: int = 0) -> SimulatedTracker:
+        """Return what makes a camera's tracks (the first: the pair's), at its beginning; for tests, too."""
+        options, rig, seed = self.options, self.true_rig, self._track_seed
+        if camera:
+            rig = Rig((rig.cameras[camera],), (rig.T_body_cams[camera],))
+            seed = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, camera))
         noise = TrackNoise(
             tracks=options.tracks, pixel_sigma_px=options.pixel_sigma_px, stereo_sigma_px=options.stereo_sigma_px,
             outlier_share=options.outlier_share, dropout_share=options.dropout_share,
             track_life_s=options.track_life_s, readout_s=options.readout_s, moving_share=options.moving_share,
             descriptors=options.descriptors,
         )  # fmt: skip
-        return SimulatedTracker(self.true_rig, self.field, self.motion, noise, np.random.default_rng(self._track_seed))
+        return SimulatedTracker(rig, self.field, self.motion, noise, np.random.default_rng(seed), camera << _ID_BITS)
 
     def _frames(self) -> Iterator[Frame]:
         options, tracker = self.options, self.tracker()
+        further = {camera: self.tracker(camera) for camera in self.true_rig.further}
         stamps = self._stamps_ns.tolist()
         zero_s = self._begin_s + _MARGIN_S
         for index, (t_s, t_ns) in enumerate(zip(self._frame_s.tolist(), stamps, strict=True)):
@@ -233,7 +319,9 @@ class PointRecording:
             else:
                 length_s = np.inf if options.moving_length_s is None else options.moving_length_s
                 tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, length_s))
-            yield Frame(t_ns, index, (), tracks=tracks)
+            others = ((camera, one.see(t_s, moving=False)) for camera, one in further.items())
+            seen = tuple(FurtherTracks(camera, one.track_ids, one.pixels_px) for camera, one in others)
+            yield Frame(t_ns, index, (), tracks=replace(tracks, further=seen))
 
     @property
     def _stamps_ns(self) -> Stamps:

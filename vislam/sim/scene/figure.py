@@ -1,7 +1,5 @@
 """A walking person as depth cameras see one: a trunk and two legs that swing, all upright cylinders."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array, ImageF32

@@ -1,7 +1,5 @@
 """Furniture of the simulated worlds, composed of boxes, cylinders and painted plates."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.sim.scene import paint, signs

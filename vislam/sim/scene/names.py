@@ -1,7 +1,5 @@
 """What things in simulated worlds are called, down to what hangs on a wall: exact labels for every pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps

@@ -4,8 +4,6 @@ A painter takes a generator, the height and width in pixels and the pixels per m
 factories here return painters, so that a world can say `rectangle(..., paint.brick((60, 80, 140)))`.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """The shell of indoor worlds: walls, floor, ceiling, and what hangs on long walls."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.sim.scene import paint, signs

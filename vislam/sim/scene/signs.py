@@ -1,7 +1,5 @@
 """Painters of things that people put into rooms: posters, labels, doors, books, screens, and walls that carry them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """The world `corridor-loop`: a walk of 70 m around a block of corridors, closed once by passing its start again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.sim.motion.path import Travel, rounded_path

@@ -1,7 +1,5 @@
 """The world `workshop-cart`: a cart drives two laps through a furnished hall of 13 x 9 m."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

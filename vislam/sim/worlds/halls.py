@@ -6,8 +6,6 @@ the same furniture in other places. The walk enters every hall the same way, so 
 the wrong hall but whole sequences of them. It passes its start again and goes on for half a round: true revisits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

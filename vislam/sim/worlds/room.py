@@ -1,7 +1,5 @@
 """The world `handheld-room`: a camera carried by hand, in all six degrees of freedom, through a furnished room."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vislam.core.messages import Array

@@ -25,7 +25,7 @@ from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
 from vislam.sim.motion.spline import BodySpline
 from vislam.sim.scene import NAMES, Renderer, Scene, painted
 from vislam.sim.sensing import DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
-from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, World, make_rig
+from vislam.sim.worlds.table import WORLD_NAMES, WORLDS, RigKind, Sensors, World, make_rig, surrounded
 from vislam.trajectory import Trajectory
 
 _START_NS = 1_000_000_000_000  # not zero, so that no code can rely on it
@@ -39,6 +39,7 @@ class SimOptions:
     """What can be chosen about a simulated recording."""
 
     rig: RigKind | None = None  # None: the world's own
+    further_cameras: Annotated[int, Field(ge=0, le=6)] = 0  # beside those, evenly around the vertical
     duration_s: Annotated[float, Field(ge=0.5)] | None = None  # seconds from the beginning
     camera_hz: Annotated[float, Field(gt=0.1, le=120.0)] | None = None  # None: the world's own
     image_width_px: Annotated[int, Field(ge=64, le=1920, multiple_of=4)] = 640  # 4:3
@@ -106,7 +107,8 @@ class Simulation:
         if options.duration_s is not None and options.duration_s > whole_s:
             raise UsageError(f"world '{name}' lasts {whole_s:.1f} s, asked for {options.duration_s} s; ask for less")
         self.duration_s = options.duration_s or whole_s
-        self.rig = make_rig(world, options.rig or world.rig, options.image_width_px)
+        rig = make_rig(world, options.rig or world.rig, options.image_width_px)
+        self.rig = surrounded(rig, options.further_cameras)
         sensors = world.sensors
         self.imu_noise: ImuNoise | None = sensors.imu
         self.problems: dict[str, int] = {}

@@ -1,9 +1,7 @@
 """The table of simulated worlds and the sensors that each carries by default."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -97,6 +95,14 @@ def make_rig(world: World, kind: RigKind, width_px: int) -> Rig:
         return Rig((camera(width_px),), (cam0,), has_depth=kind == "rgbd")
     beside = _pose(Rotation.from_rotvec([-0.004, 0.005, 0.003]).as_matrix(), np.array([_BASELINE_M, 0.0006, -0.0004]))
     return Rig((camera(width_px), camera(width_px)), (cam0, cam0 @ beside))
+
+
+def surrounded(rig: Rig, count: int) -> Rig:
+    """Return a rig with its first camera `count` times more, evenly around the body's vertical."""
+    angles = 2.0 * np.pi * np.arange(1, count + 1) / (count + 1)
+    turns = Rotation.from_rotvec(angles[:, None] * np.array([0.0, 0.0, 1.0])).as_matrix()
+    poses = [_pose(turn, np.zeros(3)) @ rig.T_body_cam0 for turn in turns]
+    return replace(rig, cameras=(*rig.cameras, *rig.cameras[:1] * count), T_body_cams=(*rig.T_body_cams, *poses))
 
 
 def _pose(R: Array, t: Array) -> Array:

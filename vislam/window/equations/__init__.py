@@ -23,6 +23,7 @@ from vislam.window.equations.projection import (
     Optics,
     Place,
     hosted,
+    hosting,
     linearised,
     measured,
     mounted,
@@ -31,6 +32,7 @@ from vislam.window.equations.projection import (
     residual,
     shift,
     sight,
+    through,
 )
 from vislam.window.equations.schur import invert
 from vislam.window.equations.solver import Problem, Room, Solution, optimise
@@ -64,6 +66,7 @@ __all__ = [
     "first_pose_prior",
     "first_prior",
     "hosted",
+    "hosting",
     "invert",
     "joint_covariance",
     "linearised",
@@ -76,6 +79,7 @@ __all__ = [
     "residual",
     "shift",
     "sight",
+    "through",
     "touched",
     "trailing_covariance",
 ]

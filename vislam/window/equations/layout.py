@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vislam.core.geometry import so3_exp, so3_log
 from vislam.core.jit import njit
-from vislam.core.lens import Lens
+from vislam.core.lens import Lenses
 from vislam.core.messages import Array
 from vislam.core.small import product, product_back
 
@@ -46,9 +46,9 @@ class Views(NamedTuple):
     """Observations [N] of landmarks [L], those of a landmark in a row and its host first."""
 
     first: Ints  # [L + 1]
-    host: Ints  # [L] keyframe whose camera 0 holds bearing and inverse depth
+    host: Ints  # [L] keyframe whose camera, that of the first observation, holds bearing and inverse depth
     keyframe: Ints  # [N]
-    camera: Ints  # [N] 0 or 1
+    camera: Ints  # [N]
     values: (
         Array  # [N, 8] x and y on z = 1; pixel from the principal point and 1 / its sigma; row of the image, -0.5 at
     )
@@ -82,11 +82,12 @@ class Camera(NamedTuple):
 
     T_body_cam: Array  # [4, 4] of camera 0
     T_cam0_cams: Array  # [C, 4, 4]
-    lenses: tuple[Lens, Lens]  # of camera 0 and of the last one
+    lenses: Lenses  # of all cameras
+    right: int  # the camera whose place counts in metres and which may be turned; -1: none makes a pair with camera 0
     rate: Array  # [M, 3] of the body at each keyframe, rad/s
     applied_offset_s: Array  # [M] time offset that is already in the stamp
     active: NDArray[np.bool_]  # [16] what is estimated
-    huber_k: Array  # [3] of a pixel's error in either camera, and of a depth's, whitened
+    huber_k: Array  # [C + 1] of a pixel's error in each camera, and of a depth's, whitened
     rho_information: float  # of the prior of inverse depth
 
 

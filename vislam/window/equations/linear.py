@@ -4,8 +4,6 @@ Matrices are upper triangles in rows: `A = U.T @ U`. Their transposes are lower 
 own order, so nothing is copied.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs

@@ -1,7 +1,5 @@
 """What the window keeps of a keyframe that leaves: a quadratic prior on the states it was tied to."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,9 @@
 """One view of a landmark: its whitened error and the derivative of that, by carrying the landmark through the frames.
 
-A landmark is a bearing [a, b, 1] and an inverse depth rho in camera 0 of its host at the time its row was read; on its
-way it is scaled by rho. A camera at time `dt` after its keyframe's stamp sits at `R @ exp(rate * dt), p + v * dt`.
+A landmark is a bearing [a, b, 1] and an inverse depth rho in the camera of its host that saw it first, at the time its
+row was read; on its way it is scaled by rho. A right camera hosts none: camera 0 does in its place. A camera at time
+`dt` after its keyframe's stamp sits at `R @ exp(rate * dt), p + v * dt`.
+
 Vectors and rotations are tuples here, which the compiler keeps in registers. Predictions go through the lens: with the
 derivative at the pixel that was measured, whose noise the residual has, too, focal lengths would drift by it.
 """
@@ -14,7 +16,7 @@ import numpy as np
 
 from vislam.core.geometry import so3_exp
 from vislam.core.jit import njit
-from vislam.core.lens import Lens, imaged
+from vislam.core.lens import Lens, Lenses, imaged, lens_at
 from vislam.core.messages import Array
 from vislam.core.small import Mat, Vec, back, by, cross, dot, in_a_row, minus, plus, product, times, turned
 from vislam.window.equations.layout import FOCAL, METRES, RIGHT, Camera
@@ -46,6 +48,17 @@ class Mount(NamedTuple):
     p: Vec
 
 
+class Cameras(NamedTuple):
+    """All cameras in camera 0, as the calibration has them."""
+
+    R: Array  # [C, 3, 3]
+    p: Array  # [C, 3] m, as calibrated
+    lenses: Lenses
+    metres: float
+    focal: float
+    right: int
+
+
 class Optics(NamedTuple):
     """A camera in camera 0, and how it images."""
 
@@ -53,6 +66,7 @@ class Optics(NamedTuple):
     p: Vec  # as calibrated
     metres: float  # by which p and measured depths are as calibrated
     focal: float
+    is_first: bool
     is_right: bool
     lens: Lens
 
@@ -71,9 +85,11 @@ class Hosted(NamedTuple):
     """A landmark as its host has it."""
 
     place: Place
-    row: float  # at which the host saw it
+    cam: Optics  # that saw it first
+    row: float  # at which it did
     rho: float
     bearing: Vec
+    in_cam0: Vec
     in_host: Vec  # body axes
     in_world: Vec  # world axes, from the host on
 
@@ -106,15 +122,29 @@ def mounted(camera: Camera, calibration: Array) -> Mount:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def optics(camera: Camera, calibration: Array) -> tuple[Optics, Optics]:
-    """Return both cameras as the calibration has them; of one camera twice the same."""
-    T, (left, right) = camera.T_cam0_cams, camera.lenses
-    metres, focal, last = 1.0 + calibration[METRES], 1.0 + calibration[FOCAL], T[-1]
-    turned = product(last, so3_exp(calibration[RIGHT : RIGHT + 3]))
-    return (
-        Optics(in_a_row(T[0]), (T[0, 0, 3], T[0, 1, 3], T[0, 2, 3]), metres, focal, False, left),
-        Optics(in_a_row(turned), (last[0, 3], last[1, 3], last[2, 3]), metres, focal, True, right),
-    )
+def optics(camera: Camera, calibration: Array) -> Cameras:
+    """Return all cameras as the calibration has them; the right one is turned by it."""
+    T, right = camera.T_cam0_cams, camera.right
+    R = T[:, :3, :3].copy()
+    if right >= 0:
+        R[right] = product(T[right], so3_exp(calibration[RIGHT : RIGHT + 3]))
+    metres, focal = 1.0 + calibration[METRES], 1.0 + calibration[FOCAL]
+    return Cameras(R, T[:, :3, 3].copy(), camera.lenses, metres, focal, right)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def through(cams: Cameras, c: int) -> Optics:
+    """Return camera c."""
+    is_first, is_right = c == 0, c == cams.right
+    metres = cams.metres if is_first or is_right else 1.0
+    p = (cams.p[c, 0], cams.p[c, 1], cams.p[c, 2])
+    return Optics(in_a_row(cams.R[c]), p, metres, cams.focal, is_first, is_right, lens_at(cams.lenses, c))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def hosting(cams: Cameras, c: int) -> Optics:
+    """Return the camera that hosts landmarks which camera c saw first: of a pair, always the first."""
+    return through(cams, 0 if c == cams.right else c)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -134,11 +164,14 @@ def place(X: Array, k: int, rates: Array, dt: float) -> Place:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def hosted(at: Place, mount: Mount, row: float, a: float, b: float, rho: float) -> Hosted:
-    """Return a landmark of a host at a place."""
+def hosted(at: Place, mount: Mount, cam: Optics, row: float, a: float, b: float, rho: float) -> Hosted:
+    """Return a landmark of a host at a place, that a camera saw first."""
     bearing = (a, b, 1.0)
-    in_host = plus(by(mount.R, bearing), times(rho, mount.p))
-    return Hosted(at, row, rho, bearing, in_host, by(at.R, in_host))
+    in_cam0 = bearing
+    if not cam.is_first:
+        in_cam0 = plus(by(cam.R, bearing), times(rho, cam.p))
+    in_host = plus(by(mount.R, in_cam0), times(rho, mount.p))
+    return Hosted(at, cam, row, rho, bearing, in_cam0, in_host, by(at.R, in_host))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -230,13 +263,16 @@ def _row(
     by_seen = by(mount.R, by_cam0)
     by_world = by(at.R, by_seen)
     by_host = back(host.R, by_world)
-    by_bearing = back(mount.R, by_host)
-    J[k, POINT], J[k, POINT + 1] = by_bearing[0], by_bearing[1]
+    by_first = by_bearing = back(mount.R, by_host)
     J[k, POINT + 2] = (
         dot(minus(by_host, by_seen), mount.p) + dot(by_world, seen.gap) - seen.cam.metres * dot(by_cam0, seen.cam.p)
     )  # fmt: skip
+    if not landmark.cam.is_first:
+        by_bearing = back(landmark.cam.R, by_first)
+        J[k, POINT + 2] += dot(by_first, landmark.cam.p)
+    J[k, POINT], J[k, POINT + 1] = by_bearing[0], by_bearing[1]
     J[k, CALIBRATED + FOCAL] = by_lens[0]
-    J[k, CALIBRATED + METRES] = by_lens[1] - rho * dot(by_cam0, seen.cam.p)
+    J[k, CALIBRATED + METRES] = by_lens[1] - (rho * dot(by_cam0, seen.cam.p) if seen.cam.is_right else 0.0)
     by_right = cross(by_cam, seen.in_cam) if seen.cam.is_right else (0.0, 0.0, 0.0)
     J[k, CALIBRATED + RIGHT], J[k, CALIBRATED + RIGHT + 1], J[k, CALIBRATED + RIGHT + 2] = by_right
     if same:  # moving the body moves landmark and camera alike
@@ -245,7 +281,7 @@ def _row(
         return
     by_turn_host, by_turn = cross(landmark.in_host, by_host), cross(by_seen, seen.in_seen)  # when the rows were read
     by_pose_host, by_pose, moved = by(host.turn, by_turn_host), by(at.turn, by_turn), times(rho, by_world)
-    by_mount = plus(cross(landmark.bearing, by_bearing), cross(by_cam0, seen.in_cam0))
+    by_mount = plus(cross(landmark.in_cam0, by_first), cross(by_cam0, seen.in_cam0))
     by_time_host = dot(by_turn_host, host.rate) + dot(moved, host.velocity)
     by_time = dot(by_turn, at.rate) - dot(moved, at.velocity)
     J[k, 0], J[k, 1], J[k, 2] = by_pose_host

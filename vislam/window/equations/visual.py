@@ -1,6 +1,6 @@
 """Reprojection errors of landmarks hosted in keyframes, with time offset, rolling shutter and extrinsic rotation.
 
-A landmark is a bearing [a, b, 1] and an inverse depth rho in camera 0 of its host at the time its row was read; points
+A landmark is a bearing [a, b, 1] and an inverse depth rho in its host's camera at the time its row was read; points
 at infinity are ordinary (Civera et al., "Inverse depth parametrization for monocular SLAM", TRO 2008). A camera at time
 `dt` after its keyframe's stamp sits at `R @ exp(rate * dt), p + v * dt`. Derivatives of states that the marginal prior
 holds are taken where it was linearised (first estimates: Huang, Mourikis and Roumeliotis, ISER 2008), so that the prior
@@ -25,6 +25,7 @@ from vislam.window.equations.projection import (
     Mount,
     Place,
     hosted,
+    hosting,
     linearised,
     measured,
     mounted,
@@ -34,6 +35,7 @@ from vislam.window.equations.projection import (
     robust,
     shift,
     sight,
+    through,
 )
 from vislam.window.equations.schur import Landmarks, invert
 
@@ -47,23 +49,24 @@ def cost(X: Array, points: Array, calibration: Array, views: Views, camera: Came
     mount, total = mounted(camera, calibration), 0.0
     first, hosts, keyframes, cameras, values = views
     cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
-    huber_k = camera.huber_k
+    huber_k, deep = camera.huber_k, len(camera.huber_k) - 1
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 5]
+        own = hosting(cams, cameras[first[p]])
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, row))
-        landmark = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
+        landmark = hosted(at_host, mount, own, row, points[p, 0], points[p, 1], rho)
         total += camera.rho_information * rho * rho
         for n in range(first[p], first[p + 1]):
             k, view = keyframes[n], measured(values, n)
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
-            cam = cams[cameras[n]]
+            cam = through(cams, cameras[n])
             ahead, e = residual(sight(landmark, at, mount, cam).in_cam, rho, view, cam)
             if not ahead:
                 total += _BEHIND_COST
                 squares[n, 0], squares[n, 1] = 1e6, 0.0
                 continue
             squares[n, 0], squares[n, 1] = e[0] * e[0] + e[1] * e[1], e[2] * e[2]
-            total += robust(squares[n, 0], huber_k[cameras[n]])[1] + robust(squares[n, 1], huber_k[2])[1]
+            total += robust(squares[n, 0], huber_k[cameras[n]])[1] + robust(squares[n, 1], huber_k[deep])[1]
     return 0.5 * total
 
 
@@ -94,21 +97,22 @@ def linearise(
     mount, calibrated = mounted(camera, calibration), poses_at + 6 * len(X)
     first, hosts, keyframes, cameras, values = views
     cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
-    huber_k = camera.huber_k
+    huber_k, deep = camera.huber_k, len(camera.huber_k) - 1
     J, ours, theirs = np.zeros((3, COLUMNS)), np.empty((POINT + 3, _OWN)), np.empty((6, COLUMNS))
     blocks, gradients, cross = landmarks.blocks, landmarks.gradients, landmarks.cross
     cross[:] = 0.0
     for p in range(len(points)):
         host, rho, row = hosts[p], points[p, 2], values[first[p], 5]
+        own = hosting(cams, cameras[first[p]])
         dt_host = shift(offsets_s, calibration, host, row)
         at_host = at_fixed = place(X, host, rates, dt_host)
-        landmark = fixed = hosted(at_host, mount, row, points[p, 0], points[p, 1], rho)
+        landmark = fixed = hosted(at_host, mount, own, row, points[p, 0], points[p, 1], rho)
         if held[host]:
             at_fixed = place(X_first, host, rates, dt_host)
-            fixed = hosted(at_fixed, mount, row, points[p, 0], points[p, 1], rho)
+            fixed = hosted(at_fixed, mount, own, row, points[p, 0], points[p, 1], rho)
         ours[:] = 0.0
         for n in range(first[p], first[p + 1]):
-            k, view, cam = keyframes[n], measured(values, n), cams[cameras[n]]
+            k, view, cam = keyframes[n], measured(values, n), through(cams, cameras[n])
             dt = shift(offsets_s, calibration, k, view.row)
             at = at_host if k == host else place(X, k, rates, dt)
             seen = sight(landmark, at, mount, cam)
@@ -122,7 +126,7 @@ def linearise(
                 ahead = residual(seen.in_cam, rho, view, cam)[0]
             if not ahead:
                 continue
-            linearised(fixed, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
+            linearised(fixed, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[deep]), J)
             rows = 3 if view.depth_weight > 0.0 else 2
             _add_squares(J, rows, 0, ours)
             if k != host:
@@ -194,13 +198,13 @@ def start(
     for p in range(len(points)):
         if not wanted[p]:
             continue
-        host, own = hosts[p], measured(values, first[p])
+        host, own, eye = hosts[p], measured(values, first[p]), hosting(cams, cameras[first[p]])
         at_host = place(X, host, rates, shift(offsets_s, calibration, host, own.row))
-        far = hosted(at_host, mount, own.row, own.x, own.y, 0.0)
-        near = hosted(at_host, mount, own.row, own.x, own.y, 1.0)
+        far = hosted(at_host, mount, eye, own.row, own.x, own.y, 0.0)
+        near = hosted(at_host, mount, eye, own.row, own.x, own.y, 1.0)
         numerator, denominator = 1e2 * rho_start, 1e2
         for n in range(first[p], first[p + 1]):
-            k, view, cam = keyframes[n], measured(values, n), cams[cameras[n]]
+            k, view, cam = keyframes[n], measured(values, n), through(cams, cameras[n])
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
             at_infinity = sight(far, at, mount, cam).in_cam
             by_rho = minus(sight(near, at, mount, cam).in_cam, at_infinity)
@@ -224,24 +228,25 @@ def _refine(
     """Move landmark p [3] by three Gauss-Newton steps with the poses fixed."""
     first, hosts, keyframes, cameras, values = views
     cams, rates, offsets_s = optics(camera, calibration), camera.rate, camera.applied_offset_s
-    huber_k = camera.huber_k
+    huber_k, deep = camera.huber_k, len(camera.huber_k) - 1
     host, row, J = hosts[p], values[first[p], 5], np.zeros((3, COLUMNS))
+    own = hosting(cams, cameras[first[p]])
     H, b, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for _ in range(3):
         for i in range(3):
             b[i] = camera.rho_information * point[i]
             for j in range(3):
                 H[i, j] = camera.rho_information if i == j else 0.0
-        landmark = hosted(at_host, mount, row, point[0], point[1], point[2])
+        landmark = hosted(at_host, mount, own, row, point[0], point[1], point[2])
         for n in range(first[p], first[p + 1]):
             k, view = keyframes[n], measured(values, n)
             at = at_host if k == host else place(X, k, rates, shift(offsets_s, calibration, k, view.row))
-            cam = cams[cameras[n]]
+            cam = through(cams, cameras[n])
             seen = sight(landmark, at, mount, cam)
             ahead, error = residual(seen.in_cam, landmark.rho, view, cam)
             if not ahead:
                 continue
-            linearised(landmark, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[2]), J)
+            linearised(landmark, seen, view, k == host, error, (huber_k[cameras[n]], huber_k[deep]), J)
             for m in range(3 if view.depth_weight > 0.0 else 2):
                 for i in range(3):
                     b[i] += J[m, POINT + i] * J[m, ERROR]

@@ -1,7 +1,8 @@
 // The page of a live run: asks for what is new, a few times a second, one request after the other.
-import { element, floats, octets } from "./data.js";
+import { DECISIONS, element, floats, octets } from "./data.js";
 import { layerButtons } from "./layers.js";
 import { LiveMap } from "./map.js";
+import { Plan } from "./plan.js";
 import { Plots } from "./plots.js";
 import { View } from "./view.js";
 import { Wizard } from "./wizard.js";
@@ -15,12 +16,14 @@ const SURE_MS = 4000;
 const LABELS = { start: "Start", stop: "Stop", save: "Save map" };
 
 const at = (id) => document.getElementById(id);
-const page = { map: new LiveMap(), view: null, plots: null, state: null, drawn: 0, reach: 0, touched: false, answers: 0 };
+const page = { map: new LiveMap(), refusal: "", view: null, plots: null, state: null, drawn: 0, reach: 0, touched: false, answers: 0 };
+
+class Lost extends Error {} // nothing answers; all other errors are ours
 
 async function asked(path) {
-  const answer = await fetch(path, { cache: "no-store" });
-  if (answer.status === 401) location.reload();
-  if (!answer.ok) throw new Error(`${path}: ${answer.status}`);
+  const answer = await fetch(path, { cache: "no-store" }).catch(() => null);
+  if (answer && answer.status === 401) location.reload();
+  if (!answer || !answer.ok) throw new Lost(path);
   return answer.json();
 }
 
@@ -31,31 +34,53 @@ export async function command(values) {
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify(values),
     });
-    if (!answer.ok) at("line").textContent = (await answer.json()).error;
+    page.refusal = answer.ok ? "" : (await answer.json()).error;
   } catch (error) {
-    at("line").textContent = "Nothing answers: the command was not heard.";
+    page.refusal = "Nothing answers: the command was not heard.";
   }
+}
+
+// A button; with a question it asks before it acts.
+function buttonOf(name, label, act, question = "") {
+  const button = element("button", name, label);
+  button.type = "button";
+  button.addEventListener("click", () => {
+    if (!question || button.classList.contains("sure")) return act();
+    button.classList.add("sure");
+    button.textContent = question;
+    setTimeout(() => {
+      button.classList.remove("sure");
+      button.textContent = label;
+    }, SURE_MS);
+  });
+  return button;
 }
 
 function commandButtons(can) {
   const parent = at("commands");
   if (parent.dataset.can === can.join()) return;
   parent.dataset.can = can.join();
-  parent.replaceChildren(...can.map((name) => {
-    const button = element("button", name, LABELS[name] || name);
-    button.type = "button";
-    button.addEventListener("click", () => {
-      if (name === "stop" && !button.classList.contains("sure")) {
-        button.classList.add("sure");
-        button.textContent = "Really stop?";
-        setTimeout(() => {
-          button.classList.remove("sure");
-          button.textContent = LABELS.stop;
-        }, SURE_MS);
-      } else command({ do: name });
-    });
-    return button;
-  }));
+  const question = (name) => (name === "stop" ? "Really stop?" : "");
+  parent.replaceChildren(...can.map((name) => buttonOf(name, LABELS[name] || name, () => command({ do: name }), question(name))));
+}
+
+// What is known of the loop that was clicked, and how to take it out of the graph.
+function showLoop(k) {
+  const row = page.view.data.loops.rows[k];
+  const head = element("h3", "", `Loop ${row.from} – ${row.to}, ${row.decision}`);
+  head.prepend(element("i", `dot ${row.decision}`));
+  const parts = [head, element("p", "note", row.text)];
+  if (row.decision === "accepted" && page.state.can.includes("save")) {
+    const undo = () => {
+      command({ do: "undo", loop: String(row.id) });
+      parts[1].textContent = "It is taken out with the next keyframe.";
+    };
+    parts.push(buttonOf("undo", "Undo", undo, "Really undo?"));
+  }
+  parts.push(buttonOf("close", "×", () => (at("loop").hidden = true)));
+  at("loop").replaceChildren(...parts);
+  at("loop").hidden = false;
+  page.view.choose(k);
 }
 
 const fixed = (value, digits, unit) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)}${unit}`);
@@ -78,10 +103,9 @@ function factsOf(state) {
   if (state.every > 1) facts.push(["Too slow", `one frame in ${state.every}`, "state-degraded"]);
   if (state.map_left_out) facts.push(["Map too slow", `${state.map_left_out} left out`, "state-degraded"]);
   for (const [name, word] of Object.entries(state.sensors || {})) facts.push([name, word, word === "well" ? "state-ok" : "state-lost"]);
-  if (map.keyframes) {
-    const closed = page.map.loops.filter((loop) => loop[2] === "accepted").length;
-    facts.push(["Keyframes", `${map.keyframes}, graph ${map.graph_revision}`]);
-    facts.push(["Loops", `${closed} of ${page.map.loops.length} candidates`]);
+  if (map.keyframes) facts.push(["Keyframes", `${map.keyframes}, graph ${map.graph_revision}`]);
+  for (const decision of DECISIONS) {
+    if (map.loops[decision]) facts.push([`Loops ${decision}`, String(map.loops[decision]), decision]);
   }
   return facts;
 }
@@ -92,6 +116,7 @@ function showFacts(state) {
     if (mark) term.prepend(element("i", `dot ${mark}`));
     return [term, element("dd", "", value)];
   }));
+  at("reasons").replaceChildren(...((state.verdict || {}).reasons || []).map((reason) => element("li", "", reason)));
   at("reason").textContent = state.frame ? state.frame.reason : "";
   const bad = new Set(["invalid", "gate_reject", "doubtful", "dead_reckoning"]);
   const health = state.pose ? state.pose.health : [];
@@ -108,26 +133,25 @@ function showLists(state) {
     return item;
   }));
   const said = [
-    ...(state.saved || []).map((saved) => [saved.is_well ? "saved" : "warning", saved.text]),
+    ...(state.saved || []).map((saved) => [saved.is_well ? "saved" : "warning", saved.text, null]),
     ...(state.notices || []).slice().reverse(),
   ];
   at("notices-card").hidden = !said.length;
-  at("notices").replaceChildren(...said.map(([level, text]) => {
+  const newest = said.find(([level]) => level !== "info");
+  at("notices-card").querySelector("summary").textContent = newest ? `Notices: ${newest[1]}` : "Notices";
+  at("notices").replaceChildren(...said.map(([level, text, t_s]) => {
     const item = element("li", level, text);
-    item.prepend(element("b", "", level));
+    item.prepend(element("b", "", level), element("time", "", fixed(t_s, 1, " s")));
     return item;
   }));
 }
 
-function showVerdict(state) {
-  const verdict = state.verdict;
-  const line = at("verdict");
-  line.hidden = !verdict;
-  if (!verdict) return;
-  line.className = `verdict ${verdict.state}`;
-  const reasons = (verdict.reasons || []).join("; ") || "nothing in the run contradicts itself";
-  const state_ = verdict.state.charAt(0).toUpperCase() + verdict.state.slice(1);
-  line.textContent = `${state_}: ${reasons}.`;
+function showVerdict({ headline }) {
+  at("verdict").className = `verdict ${headline.state}`;
+  at("verdict").textContent = headline.text;
+  at("invalid").hidden = headline.state !== "invalid";
+  at("invalid-sigma").textContent = headline.sigma || "";
+  at("invalid-reason").textContent = headline.reason || "";
 }
 
 // The picture of the run, or of the step of a calibration.
@@ -154,8 +178,9 @@ function show(state) {
   at("run-name").textContent = state.run ? `vislam live: ${state.run}` : "vislam live";
   at("phase").textContent = state.phase;
   at("phase").className = `badge ${state.phase.replaceAll(" ", "-")}`;
-  at("line").textContent = state.phase === "running" ? "" : state.line || "";
-  at("view").classList.toggle("idle", state.phase === "waiting");
+  const saved = (state.saved || []).at(-1);
+  at("line").textContent = page.refusal || (saved ? saved.text : "");
+  at("view").classList.toggle("idle", ["starting", "waiting", "getting ready"].includes(state.phase));
   commandButtons(state.can || []);
   showVerdict(state);
   showFacts(state);
@@ -190,14 +215,21 @@ function draw() {
     try {
       page.view = new View(at("view-canvas"), data);
     } catch (error) {
-      document.documentElement.classList.add("flat"); // no WebGL here: the rest of the page lives
-      page.view = null;
-      page.stale = false;
-      page.drawn = Infinity;
-      return;
+      document.documentElement.classList.add("flat"); // no WebGL here
+      page.view = new Plan(at("view-canvas"), data);
     }
-    page.view.controls.addEventListener("start", () => (page.touched = true));
+    if (page.view.controls) page.view.controls.addEventListener("start", () => (page.touched = true));
+    page.view.onLoop = showLoop;
   } else page.view.replace(data);
+  if (page.view.layers) drawLayers();
+  const { pose } = page.state;
+  if (pose && pose.R[0] !== null) page.view.setPose(pose.R, pose.xyz);
+  const flat = page.view.layers ? "" : "This browser shows no WebGL: the map is flat, from above. ";
+  at("of-map").textContent = `${flat}Points: ${data.cloud.count}, of ${page.map.clouds.size} of ${page.map.poses.size} keyframes`;
+  document.documentElement.dataset.points = data.cloud.count;
+}
+
+function drawLayers() {
   const names = [...page.view.layers.keys()].join();
   if (names !== page.layers) {
     page.layers = names;
@@ -209,10 +241,6 @@ function draw() {
     page.reach = page.view.reach;
     page.view.overview();
   }
-  const { pose } = page.state;
-  if (pose && pose.R[0] !== null) page.view.setPose(pose.R, pose.xyz);
-  at("of-map").textContent = `Points: ${data.cloud.count}, of ${page.map.clouds.size} of ${page.map.poses.size} keyframes`;
-  document.documentElement.dataset.points = data.cloud.count;
 }
 
 async function followVision(state) {
@@ -238,7 +266,7 @@ async function turn() {
     draw();
     await followVision(state);
   } catch (error) {
-    if (!(error instanceof TypeError) && !/\d{3}$/.test(error.message)) throw error; // ours, not the network's
+    if (!(error instanceof Lost)) throw error;
     const isOver = page.state && ["ending", "ended"].includes(page.state.phase);
     at("phase").textContent = isOver ? "ended" : "no connection";
     at("phase").className = "badge";
@@ -246,6 +274,8 @@ async function turn() {
     at("line").textContent = isOver
       ? "The run has ended and its folder is written."
       : "Nothing answers: the run has ended, or the way to it is cut.";
+    at("invalid").hidden = true;
+    if (!isOver) showVerdict({ headline: { state: "lost", text: "No connection: what stands below is old." } });
     commandButtons([]);
     wait = LOST_MS;
   }

@@ -60,7 +60,7 @@ export class LiveMap {
       labels: { live: "Path of the pose", graph: "Keyframes" },
       cloud: this.cloud(),
       loops: {
-        rows: known.map(([from, to, decision, text]) => ({ from, to, decision, text })),
+        rows: known.map(([from, to, decision, text, id]) => ({ from, to, decision, text, id })),
         ends: new Float32Array(known.flatMap(([from, to]) => [...this.position(from), ...this.position(to)])),
       },
     };

@@ -89,7 +89,8 @@ export class Wizard {
       if (wizard.files) said.append(element("p", "note", `Written: ${wizard.files.join(", ")}`));
       parts.push(said);
     }
-    parts.push(element("p", "note", "Start begins the run. Before that, sensors can be calibrated here."));
+    const can = Object.keys(steps).length ? "Before that, sensors can be calibrated here." : "It has no sensors that one could calibrate.";
+    parts.push(element("p", "note", `Start begins the run. ${can}`));
     const list = element("div", "kinds");
     for (const [kind, summary] of Object.entries(steps)) {
       const row = element("div", "kind");

@@ -9,7 +9,7 @@
 #define OLDEST_NS 100000000 /* choose what your machine may drive blind */
 
 int main(int count, char **arguments) {
-    vislam_pose_reader reader = {count > 1 ? arguments[1] : "/dev/shm/vislam-pose", NULL, 0, 0};
+    vislam_pose_reader reader = {count > 1 ? arguments[1] : "/dev/shm/vislam-pose", NULL, 0, 0, 0};
     const struct timespec period = {0, 10000000};
     vislam_pose pose;
     for (;;) {

@@ -113,17 +113,24 @@ static inline int vislam_pose_is_sound(const vislam_pose *pose) {
            pose->size == sizeof(vislam_pose) && vislam_crc32(pose, offsetof(vislam_pose, crc32)) == pose->crc32;
 }
 
-/* Map /dev/shm/NAME; NULL where it is not there, too small, or of another user, who may write anything into it. */
-static inline const vislam_pose_slot *vislam_pose_open(const char *path) {
+/* Map /dev/shm/NAME; NULL where it is not there, too small, or others than this user, root and `owner` may write to it.
+ *
+ * `owner` is the user whose `vislam live --live.group GROUP` lets this one read; 0 names none. */
+static inline const vislam_pose_slot *vislam_pose_open_of(const char *path, uid_t owner) {
     struct stat found;
     void *memory = MAP_FAILED;
     int file = open(path, O_RDONLY);
     if (file < 0) return NULL;
-    if (fstat(file, &found) == 0 && S_ISREG(found.st_mode) && (found.st_uid == geteuid() || found.st_uid == 0) &&
+    if (fstat(file, &found) == 0 && S_ISREG(found.st_mode) && (found.st_mode & (S_IWGRP | S_IWOTH)) == 0 &&
+        (found.st_uid == geteuid() || found.st_uid == owner || found.st_uid == 0) &&
         found.st_size >= (off_t)sizeof(vislam_pose_slot))
         memory = mmap(NULL, sizeof(vislam_pose_slot), PROT_READ, MAP_SHARED, file, 0);
     close(file);
     return memory == MAP_FAILED ? NULL : (const vislam_pose_slot *)memory;
+}
+
+static inline const vislam_pose_slot *vislam_pose_open(const char *path) {
+    return vislam_pose_open_of(path, 0);
 }
 
 /* Copy the newest pose out of shared memory; 0 when there is none yet, or the writer was in between (try again). */
@@ -147,6 +154,7 @@ typedef struct vislam_pose_reader {     /* begin with {.path = "/dev/shm/vislam-
     const vislam_pose_slot *slot;       /* NULL: nothing is mapped */
     dev_t device;                       /* of what is mapped */
     ino_t inode;
+    uid_t owner;                        /* whose pose is read, besides this user's and root's; see vislam_pose_open_of */
 } vislam_pose_reader;
 
 /* Let go of the memory; vislam_pose_latest maps it again. */
@@ -162,7 +170,7 @@ static inline int vislam_pose_latest(vislam_pose_reader *reader, vislam_pose *ou
     struct stat found;
     int is_there = stat(reader->path, &found) == 0;
     if (is_there && (reader->slot == NULL || found.st_ino != reader->inode || found.st_dev != reader->device)) {
-        const vislam_pose_slot *slot = vislam_pose_open(reader->path);
+        const vislam_pose_slot *slot = vislam_pose_open_of(reader->path, reader->owner);
         if (slot != NULL) {             /* of a still newer writer, if it came in between: then mapped once more */
             vislam_pose_close(reader);
             reader->slot = slot;

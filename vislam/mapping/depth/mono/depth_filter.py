@@ -1,7 +1,5 @@
 """The depth filter of one reference image."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2

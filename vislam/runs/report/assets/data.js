@@ -1,6 +1,7 @@
 // What the page carries, unpacked: little-endian typed arrays in base64.
 
-export const DECISIONS = ["accepted", "pending", "rejected"];
+export const DECISIONS = ["accepted", "pending", "rejected", "undone"];
+export const LOOP_COLORS = { accepted: "good", pending: "warn", rejected: "bad", undone: "muted" };
 export const STATES = ["ok", "degraded", "lost", "blind"];
 
 function bytesOf(text) {

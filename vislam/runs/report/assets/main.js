@@ -1,9 +1,10 @@
 // Joins the view, the plots and the details: one moment, one chosen loop.
-import { readData } from "./data.js";
+import { element, readData } from "./data.js";
 import { Details } from "./details.js";
 import { addLabels } from "./labels.js";
 import { layerButtons } from "./layers.js";
 import { Plots } from "./plots.js";
+import { sortTables } from "./sort.js";
 import { View } from "./view.js";
 
 const PLAY_MS = 50;
@@ -40,6 +41,9 @@ function start() {
     view = new View(at("view-canvas"), data);
   } catch (error) {
     root.classList.add("flat"); // no WebGL here: the pictures stay, the plots live
+    const word = element("p", "note", "This browser shows no WebGL: here is the path from above, flat; it does not turn.");
+    const picture = document.querySelector(".from-above .scroll");
+    at("view-canvas").closest(".canvas").replaceChildren(word, ...(picture ? [picture] : []));
   }
   const plots = new Plots(at("view-plots"), data);
   const details = new Details(at("view-details"), data);
@@ -73,6 +77,7 @@ function start() {
     plots.paint();
   });
   setTime(Math.min(data.paths[data.best].t[0], data.end_s));
+  document.querySelectorAll(".sortable").forEach(sortTables);
   window.vislamReport = { view, plots, details, data };
   root.dataset.ready = "yes";
 }

@@ -1,6 +1,6 @@
 // The map and the trajectories in 3-D. Draws only when something has changed; while it turns, only as many points as
 // the machine can draw 20 times a second.
-import { DECISIONS, color, nearest } from "./data.js";
+import { DECISIONS, LOOP_COLORS, color, nearest } from "./data.js";
 
 /* global THREE */
 
@@ -8,7 +8,7 @@ const FRAME_MS = 45;
 const FEWEST = 20000;
 const FIRST = 100000; // points of the first picture
 const PATH_WIDTH = 0.003; // half of it, in radii of the scene: lines of WebGL have one pixel whatever one asks for
-const LOOP_COLORS = { accepted: "good", pending: "warn", rejected: "bad" };
+const HIDDEN = ["rejected", "undone"]; // until one asks for them
 const MOUSE = { hits: 9, rolls: 5 }; // px: so far from a loop a click still means it, and so far the mouse may move
 const FINGER = { hits: 22, rolls: 12 };
 
@@ -72,6 +72,7 @@ export class View {
       high[k] = Math.max(high[k], p);
     };
     paths[best].xyz.forEach((value, k) => take(value, k % 3));
+    this.path = { low: new THREE.Vector3(...low), high: new THREE.Vector3(...high) };
     if (cloud.count) cloud.near.forEach((corner) => corner.forEach(take));
     this.low = new THREE.Vector3(...low);
     this.high = new THREE.Vector3(...high);
@@ -150,10 +151,10 @@ export class View {
       if (!indices.length) continue;
       const xyz = new Float32Array(6 * indices.length);
       indices.forEach((k, place) => xyz.set(ends.subarray(6 * k, 6 * k + 6), 6 * place));
-      const node = this.line(xyz, LOOP_COLORS[decision], decision === "rejected" ? 0.5 : 0.9, THREE.LineSegments);
+      const node = this.line(xyz, LOOP_COLORS[decision], HIDDEN.includes(decision) ? 0.5 : 0.9, THREE.LineSegments);
       node.userData.indices = indices;
       const label = `Loops ${decision}`;
-      this.add(`loops-${decision}`, node, label, LOOP_COLORS[decision], decision !== "rejected");
+      this.add(`loops-${decision}`, node, label, LOOP_COLORS[decision], !HIDDEN.includes(decision));
       this.loopNodes[decision] = node;
     }
     this.chosen = this.line(new Float32Array(6), "accent", 1, THREE.LineSegments);
@@ -216,20 +217,30 @@ export class View {
   }
 
   // Look at all of it from above and aside.
-  overview(direction = [-0.62, -0.85, 0.95]) {
-    const way = new THREE.Vector3(...direction).normalize();
+  overview() {
+    const way = new THREE.Vector3(-0.62, -0.85, 0.95).normalize();
     const target = this.middle.clone();
     target.z = this.low.z; // what is near takes more of the picture than what is far
+    this.look(target, way, (2.15 * this.reach) / Math.min(this.camera.aspect || 1, 1.2));
+  }
+
+  // The whole path and a margin around it.
+  fromAbove() {
+    this.resize();
+    const size = this.path.high.clone().sub(this.path.low);
+    const tangent = Math.tan((this.camera.fov * Math.PI) / 360);
+    const away = Math.max(size.y, size.x / this.camera.aspect, 0.1 * this.reach) / (2 * tangent);
+    const target = this.path.low.clone().addScaledVector(size, 0.5);
+    this.look(target, new THREE.Vector3(0, -0.001, 1), 1.15 * away + size.z / 2);
+  }
+
+  look(target, way, away) {
     this.controls.target.copy(target);
-    this.camera.position.copy(target).addScaledVector(way, (2.15 * this.reach) / Math.min(this.camera.aspect || 1, 1.2));
+    this.camera.position.copy(target).addScaledVector(way, away);
     this.camera.near = 0.005 * this.reach;
     this.camera.far = 30 * this.reach;
     this.controls.update();
     this.resize();
-  }
-
-  fromAbove() {
-    this.overview([0, -0.001, 1]);
   }
 
   paint() {
@@ -353,6 +364,7 @@ export class View {
 
   clickPath(x, y, hits) {
     const path = this.data.paths[this.data.best];
+    if (!path.t) return;
     let best = [hits, null];
     for (let k = 0; k < path.t.length; k++) {
       const p = this.project(path.xyz[3 * k], path.xyz[3 * k + 1], path.xyz[3 * k + 2]);

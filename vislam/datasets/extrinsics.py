@@ -1,0 +1,61 @@
+"""Do the places of cameras fit what they and the gyroscope saw? For doctor, and for a run that went wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+
+import numpy as np
+
+from vislam.core.camera import Rig
+from vislam.core.errors import DataError
+from vislam.core.findings import Finding
+from vislam.core.recording import Problems, Recording
+from vislam.datasets.camera_turns import follow_turns, judged_turns, turn_places
+from vislam.datasets.loaders import FrameTable
+from vislam.datasets.plausibility import ImuFacts, imu_facts
+from vislam.datasets.rig_checks import judged_cameras
+from vislam.datasets.stream import FileRecording, Survey, open_loader
+from vislam.datasets.tables import Row
+
+_CHECKED_FRAMES = 6
+Rows = Callable[[], Iterator[Row[list[float]]]]  # inertial ones, calibrated; begins again at every call
+
+
+def judged_places(found: Survey, rig: Rig, frames: FrameTable) -> list[Finding]:
+    """Return how some frames fit the places of several cameras; raises DataError where two sit at one place."""
+    chosen = np.unique(np.linspace(0, len(frames.t_ns) - 1, _CHECKED_FRAMES).astype(int))
+    with closing(open_loader(found, rig, frames)) as loader:
+        return judged_cameras(rig, [loader.load(int(i)).images for i in chosen])
+
+
+def judged_turns_of(
+    camera: int, found: Survey, rig: Rig, frames: FrameTable, facts: ImuFacts, rows: Rows
+) -> list[Finding]:
+    """Return how turns that a camera of a rig saw fit the gyroscope's; raises DataError where images cannot be read."""
+    with closing(open_loader(found, rig, frames, camera + 1)) as loader:
+        tracks = follow_turns(
+            turn_places(facts, frames.t_ns), frames.t_ns,
+            lambda frame: [image for image in loader.load(frame).images[camera:] if image.size],
+        )  # fmt: skip
+    R_body_cam, bias = rig.T_body_cams[camera][:3, :3], facts.gyro_bias_rad_s
+    return judged_turns(rig.cameras[camera], R_body_cam, tracks, rows, bias, f"cam{camera}")
+
+
+def contradicted_extrinsics(recording: Recording) -> tuple[str, ...]:
+    """Return what on disk contradicts the places of the cameras that a run read, and what to do then."""
+    if not isinstance(recording, FileRecording) or not recording.frame_count:
+        return ()
+    found, frames, used = recording.survey, recording.frames, recording.cameras_read
+    rig = Rig(recording.rig.cameras[:used], recording.rig.T_body_cams[:used])
+
+    def rows() -> Iterator[Row[list[float]]]:
+        return ((s.t_ns, [*s.gyro_rad_s, *s.accel_m_s2]) for s in recording.imu_samples(Problems()))
+
+    try:
+        findings = judged_places(found, rig, frames) if used > 1 else []
+        if recording.imu_noise is not None and len((facts := imu_facts(rows())).window_t_ns):
+            findings += [f for k in (0, *rig.further) for f in judged_turns_of(k, found, rig, frames, facts, rows)]
+    except DataError:
+        return ()  # what cannot be read is said elsewhere
+    return tuple(f"{finding.what}: {finding.next_step}" for finding in findings if finding.severity == "error")
