@@ -7,9 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from waiting import wait_for
-
-PATIENCE_S = 1800.0  # a busy machine is no failure; nothing waits so long otherwise
+from waiting import HUNG_S, wait_for
 
 
 @contextmanager
@@ -26,8 +24,8 @@ def dask_cluster(folder, names=("one", "two")):
         workers = {name: _worker(address, name, folder) for name in names}
         processes += workers.values()
         if names:
-            with distributed.Client(address, timeout=PATIENCE_S) as client:
-                client.wait_for_workers(len(names), timeout=PATIENCE_S)
+            with distributed.Client(address, timeout=HUNG_S) as client:
+                client.wait_for_workers(len(names), timeout=HUNG_S)
         yield address, workers
     finally:
         for process in processes:

@@ -7,13 +7,13 @@ from typing import Any, TypeVar
 
 from vislam.runs.record import Recorded
 
-_HUNG_S = 1800.0  # only ends a hang
+HUNG_S = 600.0  # only ends a hang; nothing waits so long otherwise
 Found = TypeVar("Found")
 
 
 def wait_for(condition: Callable[[], Found], what: Callable[[], object] = lambda: "what should come") -> Found:
     """Return what a condition gives as soon as it holds; `what` tells what was waited for."""
-    end_s = time.monotonic() + _HUNG_S
+    end_s = time.monotonic() + HUNG_S
     while not (found := condition()):
         assert time.monotonic() < end_s, f"waited in vain for {what()}"
         time.sleep(0.005)

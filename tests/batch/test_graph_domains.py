@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dask_cluster import PATIENCE_S, dask_cluster
+from dask_cluster import dask_cluster
 from vislam import VislamError
 from vislam.batch import (
     DaskTeam,
@@ -19,6 +19,7 @@ from vislam.batch import (
 from vislam.batch.posegraph.domains import Alone
 from vislam.cli import run_verb
 from vislam.config import GraphWorldConfig, PoseGraphConfig
+from waiting import HUNG_S
 
 WORLD = GraphWorldConfig(poses=4000, loops_per_pose=1.5, rotation_sigma_deg=0.5)
 
@@ -83,7 +84,7 @@ def test_a_killed_worker_changes_nothing(small_domains, tmp_path):
             done.append(iteration)
             if iteration == 2:
                 workers["one"].kill()
-                workers["one"].wait(PATIENCE_S)
+                workers["one"].wait(HUNG_S)
 
         found = optimize_pose_graph(made.problem, progress=kill_one, team=DaskTeam(client))
         assert len(client.scheduler_info()["workers"]) == 1

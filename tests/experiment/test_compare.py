@@ -13,11 +13,9 @@ from tiny import PLAN, jobs_here, write_plan
 from vislam.cli import run_verb
 from vislam.experiment.recordings import open_cached
 from vislam.experiment.store import ResultStore
-from waiting import wait_for
+from waiting import HUNG_S, wait_for
 
 pytestmark = pytest.mark.usefixtures("jobs_in_this_process")
-
-PATIENCE_S = 1800.0
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +54,7 @@ def compared(folder):
 
     wait_for(lambda: first.poll() is not None or ((folder / "r.db").is_file() and count()))
     first.send_signal(signal.SIGINT)
-    _, said = first.communicate(timeout=PATIENCE_S)
+    _, said = first.communicate(timeout=HUNG_S)
     kept = count()
     with jobs_here():
         assert run_verb(arguments(folder, "--workers", "2")) == 0

@@ -11,7 +11,7 @@ import psutil
 import pytest
 from tiny import write_plan
 
-from dask_cluster import PATIENCE_S, dask_cluster
+from dask_cluster import dask_cluster
 from vislam.core.errors import UsageError
 from vislam.experiment.engines import run_locally, run_on_dask
 from vislam.experiment.isolated import run_isolated
@@ -19,7 +19,7 @@ from vislam.experiment.jobs import expand
 from vislam.experiment.plan import load_plan
 from vislam.experiment.store import ResultStore
 from vislam.experiment.worker import run_job
-from waiting import wait_for
+from waiting import HUNG_S, wait_for
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def in_thread(function):
 
 
 def test_a_crash_and_a_timeout_are_results_with_reasons(specs, tmp_path):
-    crash = run_isolated({"key": "x", "timeout_s": PATIENCE_S}, str(tmp_path))
+    crash = run_isolated({"key": "x", "timeout_s": HUNG_S}, str(tmp_path))
     assert crash["status"] == "failed"
     assert crash["reason"].startswith("crash: exit code 1; last said:")
     assert "KeyError: 'environment'" in crash["reason"]
@@ -104,7 +104,7 @@ def test_a_cluster_that_loses_a_worker_loses_and_doubles_no_result(specs, tmp_pa
         wait_for(lambda: workers_of(psutil.Process(workers["two"].pid)))
         os.kill(victim.pid, signal.SIGKILL)
         wait_for(lambda: not job.is_running() or job.status() == psutil.STATUS_ZOMBIE)
-        thread.join(PATIENCE_S)
+        thread.join(HUNG_S)
         assert not thread.is_alive()
         added = [store.add(spec["key"], "label", spec, result) for spec, result in finished]
         assert all(added)
