@@ -32,6 +32,7 @@ sys.path[:0] = [str(ROOT)]
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
+from people.figure import figure_depth  # noqa: E402
 
 from vislam.config import MapConfig  # noqa: E402
 from vislam.core.camera import Camera  # noqa: E402
@@ -41,7 +42,6 @@ from vislam.mapping.depth.image import DepthView, filter_depth, rgbd_view, scan_
 from vislam.mapping.octree.occupancy import Occupancy, Octree  # noqa: E402
 from vislam.mapping.octree.query import nearest_obstacle  # noqa: E402
 from vislam.sim import Simulation, open_world  # noqa: E402
-from vislam.sim.scene.figure import figure_depth  # noqa: E402
 from vislam.sim.scene.render import Renderer  # noqa: E402
 from vislam.sim.sensing import DepthNoise, sense_depth  # noqa: E402
 

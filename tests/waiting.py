@@ -21,14 +21,14 @@ def wait_for(condition: Callable[[], Found], what: Callable[[], object] = lambda
 
 
 def until_it_holds(frames: int = 0, imu: int = 0) -> dict[str, Any]:
-    """Return arguments of `record` that end it once it holds so many frames and samples."""
+    """Return arguments of `record` that end it once it holds so many frames and samples, or hangs."""
     stop = threading.Event()
 
     def progress(recorded: Recorded) -> None:
         if recorded.counts["frames"] >= frames and recorded.counts["imu samples"] >= imu:
             stop.set()
 
-    return {"stop": stop, "progress": progress}
+    return {"seconds": HUNG_S, "stop": stop, "progress": progress}
 
 
 class Looks:

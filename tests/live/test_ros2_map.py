@@ -27,6 +27,7 @@ from vislam.live.notices import MapCells
 from vislam.live.processes.child import Child, Flag, Signals
 from vislam.live.virtual.pilot import CommandReader
 from vislam.live.wire.mail import Outbox
+from waiting import wait_for
 
 _DOMAIN = 1 + os.getpid() % 90  # not the domain of whatever else runs here
 LEFT = 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)  # a quarter turn, x, y, z, w
@@ -223,19 +224,25 @@ def test_orders_come_over_dds_and_what_is_none_is_refused() -> None:
     )
     try:
         heard: list = []
-        while not (any(isinstance(h, Goal) for h in heard) and any(isinstance(h, Steer) for h in heard)):
+
+        def hears(*wanted: Goal | Steer) -> bool:
+            heard.extend(filter(None, [orders.take()]))
+            return all(order in heard for order in wanted)
+
+        def burst() -> bool:  # what is written before both know each other is lost
             goals.write(goal())
             for k in range(50):
                 twists.write(twist(0.1 * k, 0.2))
-            heard += filter(None, [orders.take()])
-            time.sleep(0.02)
-        while orders.take() is not None:  # what still waited
-            time.sleep(0.25)
-        for writer, message in ((goals, goal()), (twists, twist(0.0, 0.0))):
-            writer.dispose(message)  # as one that leaves does: no message
-            time.sleep(0.25)
-            assert orders.take() is None
-        assert [h.speed_m_s for h in heard if isinstance(h, Steer)][-1] == pytest.approx(4.9)  # the newest
+            return hears(found, Steer(0.1 * 49, 0.2))
+
+        wait_for(burst)
+        for writer, left, then, order in (
+            (goals, goal(), goal(x=7.0), goal_of(goal(x=7.0))),
+            (twists, twist(0.0, 0.0), twist(-1.0, 0.0), Steer(-1.0, 0.0)),
+        ):
+            writer.dispose(left)  # as one that leaves does: no message
+            writer.write(then)  # soon after another one, and not lost
+            wait_for(partial(hears, order))
     finally:
         orders.close()
 

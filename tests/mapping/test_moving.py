@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from people.figure import figure_depth
 
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.octree.occupancy import Occupancy
-from vislam.sim.scene.figure import figure_depth
 from worlds.box import CAMERA, CONFIG, RIG, T_BODY_CAM0, depth_image, keyframe, pose
 
 SPEED_M_S = 1.0

@@ -56,6 +56,7 @@ class Filtering:
         self.ekf: Ekf | MsckfEkf = make_ekf(config, noise, machine, rig, suite)
         self._seen: deque[Correction] = deque()  # on its way to the filter
         self._applied: list[Correction] = []  # since they were last taken
+        self._torn_to: NavState | None = None  # likewise: where it began again
         self._applied_readings: deque[AppliedReading] = deque(maxlen=_MOST_APPLIED)  # since they were last taken
         self._since_ns = 0  # of when the filter may hear that noise changed
         self._noise_applied = AS_MODELLED
@@ -85,7 +86,13 @@ class Filtering:
             turn, motion = R.T @ np.diag(sigmas**2) @ R, np.diag(np.repeat(_TORN[1:3], 3) ** 2)
             covariance = block_diag(turn, motion, state.covariance[9:, 9:])
             state = replace(state, T_world_body=T_odom_body, velocity_world_m_s=np.zeros(3))
-        self.ekf.resume(replace(state, covariance=covariance), vo, self.ekf.camera)
+        self._torn_to = replace(state, covariance=covariance)
+        self.ekf.resume(self._torn_to, vo, self.ekf.camera)
+
+    def take_torn(self) -> NavState | None:
+        """Return the state from which the filter began again since the last call, None: it goes on."""
+        state, self._torn_to = self._torn_to, None
+        return state
 
     def resume(self, state: NavState, vo: VoMeasurement, camera: Array | None) -> None:
         """Start where an earlier run was; `camera` is what its filter had learned, see `camera`."""

@@ -24,7 +24,11 @@ class Corrections:
         if found is not self._start and found is not None and found.last is not None:
             self._start = found
             yield Start(found.last, step.track.vo)
+        inertial = self._front.inertial
+        torn_to = None if inertial is None else inertial.filtering.take_torn()
         if not self._is_tight:
+            if torn_to is not None:
+                yield Rebase(torn_to, False, False, self._front.noise_scale)
             yield from (replace(correction, observations=no_observations()) for correction in step.corrections)
         elif step.state is not None:
             at_rest = any(correction.at_rest for correction in step.corrections)

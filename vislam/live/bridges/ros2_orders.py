@@ -36,27 +36,25 @@ class Ros2Orders:
     def __init__(self, domain: int, allow_remote: bool = False) -> None:
         """Join a domain, as `Ros2` does."""
         self._node = Node(domain, "vislam_drive", allow_remote)
-        self._goals = self._node.reader("goal_pose", PoseStamped, QOS)
-        self._places = self._node.reader("initialpose", PoseWithCovarianceStamped, QOS)
-        self._twists = self._node.reader("cmd_vel", Twist, _NEWEST)
+        goals = self._node.reader("goal_pose", PoseStamped, QOS)
+        places = self._node.reader("initialpose", PoseWithCovarianceStamped, QOS)
+        twists = self._node.reader("cmd_vel", Twist, _NEWEST)
         self._node.announce()
-        self._goal_s = self._place_s = self._said_s = -math.inf
+        self._kinds = (goals, goal_of, _GOAL_S), (places, place_of, _PLACE_S), (twists, steer_of, 0.0)
+        self._taken_s = dict.fromkeys((goal_of, place_of, steer_of), -math.inf)
+        self._said_s = -math.inf
 
     def take(self) -> Goal | Place | Steer | None:
-        """Return what was asked since the last call: of several the newest, a goal before a place before a twist."""
-        goals, places, twists = _newest(self._goals), _newest(self._places), _newest(self._twists)
-        now_s, found = time.monotonic(), list[Goal | Place | Steer | str]()
-        if goals and now_s - self._goal_s >= _GOAL_S:
-            self._goal_s = now_s
-            found += map(goal_of, goals)
-        if places and now_s - self._place_s >= _PLACE_S:
-            self._place_s = now_s
-            found += map(place_of, places)
-        found += map(steer_of, twists)
-        for order in found:
-            if not isinstance(order, str):
-                return order
-            self._refuse(order, now_s)
+        """Return what was asked: of several the newest, a goal before a place before a twist; others go on waiting."""
+        now_s = time.monotonic()
+        for reader, read, apart_s in self._kinds:
+            if now_s - self._taken_s[read] < apart_s:
+                continue
+            for message in _newest(reader):
+                self._taken_s[read], order = now_s, read(message)
+                if not isinstance(order, str):
+                    return order
+                self._refuse(order, now_s)
         return None
 
     def close(self) -> None:
