@@ -16,6 +16,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,17 +34,41 @@ matplotlib.use("Agg")
 
 from g2o_edges import BEST_CHI2, EdgeFile  # noqa: E402
 from matplotlib import pyplot as plt  # noqa: E402
+from scipy.interpolate import CubicSpline  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
 
 import vislam.window  # noqa: E402
 from vislam.config import GraphConfig, WindowConfig  # noqa: E402
 from vislam.core.geometry import align_points, se3_exp, transform  # noqa: E402
-from vislam.core.messages import Tracking, VoMeasurement  # noqa: E402
+from vislam.core.messages import Array, Tracking, VoMeasurement  # noqa: E402
 from vislam.graph import Graph, PoseGraph  # noqa: E402
-from worlds.endless_lap import STEREO, LapWorld, cart_round, window_of_truth  # noqa: E402
+from vislam.sim.motion.path import rounded_path  # noqa: E402
+from worlds.endless_lap import STEREO, LapWorld, window_of_truth  # noqa: E402
 from worlds.lap import packet_of  # noqa: E402
 from worlds.parts import MACHINE  # noqa: E402
 
 RESULTS = ROOT / "results" / "long_run"
+
+
+def cart_round(lap_s: float = 40.0) -> tuple[Callable[[Array], Array], Callable[[Array], Rotation], float]:
+    """Return one round through the hall of `workshop-cart` as a motion of `LapWorld`: it heads where it drives."""
+    path = rounded_path(
+        [(-4.55, -2.65), (4.55, -2.65), (4.55, 2.65), (-4.55, 2.65), (-4.55, -2.65), (0.0, -2.65)], 1.05
+    )
+    begin_m, end_m = 4.55, path.length_m  # both in the middle of the first side, one round apart
+    t = np.linspace(0.0, lap_s, 81)
+    xy, heading = path.at(begin_m + (end_m - begin_m) * t / lap_s)
+    xy[-1] = xy[0]
+    way = CubicSpline(t, np.column_stack([xy, np.full(len(t), 0.3)]), bc_type="periodic")
+    turn = np.unwrap(heading) - 2.0 * np.pi * t / lap_s
+    turn[-1] = turn[0]
+    rest = CubicSpline(t, turn, bc_type="periodic")
+
+    def rotation(s: Array) -> Rotation:
+        yaw = rest(np.mod(s, lap_s)) + 2.0 * np.pi * s / lap_s
+        return Rotation.from_euler("z", yaw[:, None])
+
+    return lambda s: way(np.mod(s, lap_s)), rotation, lap_s
 
 
 @dataclass

@@ -27,17 +27,17 @@ from vislam.hw.emulator import SensorError
 from vislam.hw.emulator import bridge as emulator
 from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults, at_rest, bridged
 from vislam.hw.health import Health
+from waiting import HUNG_S
 
 EXACT = (SensorError(), SensorError(), SensorError(density=(0.02, 0.02, 0.02)))  # a field without noise is a hung chip
 PERIOD_NS = 2_500_000
-LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> SerialConfig:
     """Patience of tests: a gap of seconds is no fault of the bridge on a busy machine."""
     clock = BridgeClockConfig(settle_s=0.2, bin_s=0.05)
-    return SerialConfig(port=str(tmp_path / "tty"), start_s=LONG_S, reopen_s=0.05, missing_s=LONG_S, clock=clock)
+    return SerialConfig(port=str(tmp_path / "tty"), start_s=HUNG_S, reopen_s=0.05, missing_s=HUNG_S, clock=clock)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def board(config: SerialConfig) -> Iterator[BridgeEmulator]:
 def collect(bridge: SerialBridge, enough: Callable[[list], bool]) -> list[ImuSample | MagSample]:
     """Read until there is enough, for a time that only a broken driver needs."""
     found: list[ImuSample | MagSample] = []
-    end = time.monotonic() + LONG_S
+    end = time.monotonic() + HUNG_S
     while not enough(found):
         assert time.monotonic() < end, f"{bridge.problem} {bridge.counters()}"
         found += bridge.read(0.05)
@@ -190,7 +190,7 @@ def test_an_unplugged_board_is_missed_and_taken_back(config: SerialConfig, board
     bridge = SerialBridge(replace(config, missing_s=0.05))
     before = imu(collect(bridge, lambda found: len(found) > 100))
     board.unplug()
-    end = time.monotonic() + LONG_S
+    end = time.monotonic() + HUNG_S
     while bridge.counters().get("port_lost", 0) == 0:
         assert time.monotonic() < end
         bridge.read(0.05)

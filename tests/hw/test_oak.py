@@ -23,9 +23,8 @@ from vislam.hw.library_cameras import factory_rig, open_frame_camera, open_with_
 from vislam.hw.sensors import check_devices
 from vislam.live.sources import open_live
 from vislam.runs.record import record
-from waiting import Looks, until_it_holds, wait_for
+from waiting import HUNG_S, Looks, until_it_holds, wait_for
 
-LONG_S = 600.0
 CAMERA = OakConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0, position_m=(0.1, 0.0, 0.2))
 SENSORS = replace(SensorsConfig(), oak=CAMERA)
 
@@ -93,14 +92,14 @@ def test_an_image_without_a_partner_is_left_out(world: World) -> None:
 def test_a_device_that_is_pulled_out_comes_back(world: World) -> None:
     settings = replace(SENSORS, oak=replace(CAMERA, missing_s=0.05))
     with closing(open_frame_camera("oak", settings)) as camera:
-        assert camera.read(LONG_S) is not None
+        assert camera.read(HUNG_S) is not None
         world.unplugged = True
         wait_for(lambda: camera.health() == Health.CAMERA_MISSING)
         wait_for(lambda: camera.counters().get("open_failures", 0) > 0)
         while camera.read(0.0) is not None:
             pass
         world.unplugged = False
-        assert camera.read(LONG_S) is not None
+        assert camera.read(HUNG_S) is not None
         assert (camera.counters()["opened"], camera.counters()["lost"]) == (2, 1)
 
 
@@ -149,7 +148,7 @@ SLOW = replace(SENSORS, oak=replace(CAMERA, rate_hz=33.0, imu_silent_s=30.0))
 def test_colour_comes_with_depth_aligned_on_the_device(world: World, platform: str) -> None:
     world.platform = platform
     with closing(open_frame_camera("oak,depth", SENSORS)) as camera:
-        frame = camera.read(LONG_S)
+        frame = camera.read(HUNG_S)
     assert frame is not None
     assert frame.color is not None
     assert frame.depth_m is not None
@@ -172,11 +171,11 @@ def test_images_and_its_imu_are_put_on_the_host_by_one_offset(world: World) -> N
     with closing(camera):
         samples = []
         while len(samples) < 100:
-            new = imu.read(LONG_S)
+            new = imu.read(HUNG_S)
             assert new
             samples += new
         assert "which its images have too" in imu.stamped_by
-        frame = camera.read(LONG_S)
+        frame = camera.read(HUNG_S)
     assert frame is not None
     off_ns = []
     for sample in samples:
@@ -218,7 +217,7 @@ def test_the_place_of_its_imu_is_the_factorys_or_has_to_be_told(world: World) ->
     source.close()
     camera, imu = open_with_imu("oak", told)
     with closing(camera):
-        sample = imu.read(LONG_S)[0]
+        sample = imu.read(HUNG_S)[0]
     assert isinstance(sample, ImuSample)
     assert sample.accel_m_s2[2] == pytest.approx(9.81)
     assert sample.gyro_rad_s[1] == pytest.approx(sample.accel_m_s2[1])
@@ -245,7 +244,7 @@ def test_a_device_with_its_imu_comes_back(world: World) -> None:
         wait_for(lambda: camera.counters().get("open_failures", 0) > 0)
         imu.read(0.0)
         world.unplugged = False
-        assert imu.read(LONG_S)
+        assert imu.read(HUNG_S)
         assert imu.counters()["opened"] == 2
 
 

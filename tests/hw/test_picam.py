@@ -20,9 +20,8 @@ from vislam.hw.health import Health
 from vislam.hw.library_cameras import is_library_camera, open_image_camera
 from vislam.hw.sensors import check_devices, is_video, open_camera
 from vislam.runs.record import record
-from waiting import Looks, until_it_holds, wait_for
+from waiting import HUNG_S, Looks, until_it_holds, wait_for
 
-LONG_S = 600.0
 CONFIG = PicamConfig(rate_hz=100.0, reopen_s=0.01, missing_s=30.0, start_s=30.0)
 
 
@@ -82,7 +81,7 @@ def test_a_stamp_of_no_known_clock_counts_and_the_last_age_is_used(world: World)
 
 def test_exposure_gain_and_focus_are_fixed_before_the_first_image(world: World) -> None:
     with closing(open_image_camera("picam", SensorsConfig(picam=replace(CONFIG, gain=2.5)))) as camera:
-        shots = [shot for _ in range(5) if (shot := camera.read(LONG_S)) is not None]
+        shots = [shot for _ in range(5) if (shot := camera.read(HUNG_S)) is not None]
         asked = world.opened[0].config
         assert asked["controls"] == {
             "FrameDurationLimits": (10_000, 10_000), "AeEnable": False, "ExposureTime": 10_000, "AnalogueGain": 2.5,
@@ -111,7 +110,7 @@ def test_what_the_camera_lacks_is_told(world: World) -> None:
 def test_a_first_image_that_is_late_is_waited_for(world: World) -> None:
     world.late = 3
     with closing(open_image_camera("picam", SensorsConfig(picam=CONFIG))) as camera:
-        assert camera.read(LONG_S) is not None
+        assert camera.read(HUNG_S) is not None
         assert camera.counters()["lost"] == 3
 
 

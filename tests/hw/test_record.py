@@ -25,9 +25,8 @@ from vislam.datasets.recorder import Recorder
 from vislam.hw.emulator import emulated_bus, emulated_gy85
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.runs.record import Recorded, record
-from waiting import wait_for
+from waiting import HUNG_S, wait_for
 
-LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 WIDTH, HEIGHT = 320, 240
 CONFIG = RecordConfig(min_free_gb=0.0)
 
@@ -41,7 +40,7 @@ def tty(tmp_path: Path) -> Iterator[Path]:
 @pytest.fixture
 def sensors() -> SensorsConfig:
     clock = BridgeClockConfig(settle_s=0.2, bin_s=0.05)
-    return SensorsConfig(serial=SerialConfig(start_s=LONG_S, reopen_s=0.05, clock=clock))
+    return SensorsConfig(serial=SerialConfig(start_s=HUNG_S, reopen_s=0.05, clock=clock))
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +76,7 @@ def recorded_until(rows: dict[str, int], out: Path, *arguments: object) -> None:
         wait_for(lambda: all(rows_in(out / "mav0" / name / "data.csv") >= count for name, count in rows.items()))
     finally:
         stop.set()
-        thread.join(LONG_S)
+        thread.join(HUNG_S)
 
 
 @pytest.mark.slow  # a whole run
@@ -149,7 +148,7 @@ def test_the_gy85_on_i2c_is_recorded_as_well(long_video: Path, sensors: SensorsC
 
 def start_verb(tty: Path, video: Path, out: Path) -> subprocess.Popen:
     command = [sys.executable, "-m", "vislam", "record", "--out", str(out), "--imu", f"serial:{tty}"]
-    command += ["--camera", str(video), "--min-free-gb", "0", "--serial.start-s", str(LONG_S)]
+    command += ["--camera", str(video), "--min-free-gb", "0", "--serial.start-s", str(HUNG_S)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -177,7 +176,7 @@ def test_whatever_ends_it_leaves_a_recording(tty: Path, long_video: Path, tmp_pa
         wait_for(lambda: rows_in(table) >= 3 or process.poll() is not None)
         wait_for(lambda: rows_in(out / "mav0" / "imu0" / "data.csv") >= 100 or process.poll() is not None)
         process.send_signal(number)
-        stdout, stderr = process.communicate(timeout=LONG_S)
+        stdout, stderr = process.communicate(timeout=HUNG_S)
     finally:
         process.kill()
     imu, _, frames = events_of(out)
@@ -295,7 +294,7 @@ def test_an_unplugged_imu_is_missed_and_comes_back(video: Path, sensors: Sensors
         board.plug()
         wait_for(lambda: rows_in(table) > before + 50)
         stop.set()
-        thread.join(LONG_S)
+        thread.join(HUNG_S)
     assert result[0].ended == "stopped"
     assert result[0].faults["imu"]["port_lost"] == 1
     facts = json.loads((tmp_path / "r" / "recording.json").read_text())

@@ -26,8 +26,8 @@ from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.runs.record import Recorded, record
 from vislam.runs.recorded_readings import further_ports
 from vislam.sensors.toml import load_sensor_setup
+from waiting import HUNG_S
 
-LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 CONFIG = RecordConfig(min_free_gb=0.0)
 CART = """
 [serial]
@@ -70,7 +70,7 @@ def burst(second: int, north_min: float) -> bytes:
 @pytest.fixture
 def sensors() -> SensorsConfig:
     clock = BridgeClockConfig(settle_s=0.2, bin_s=0.05)
-    return SensorsConfig(serial=SerialConfig(start_s=LONG_S, reopen_s=0.05, clock=clock))
+    return SensorsConfig(serial=SerialConfig(start_s=HUNG_S, reopen_s=0.05, clock=clock))
 
 
 class Surroundings:
@@ -122,7 +122,7 @@ def recorded_until_all_spoke(around: Surroundings, out: Path, sensors: SensorsCo
     stop = threading.Event()
 
     def look() -> None:
-        end = time.monotonic() + LONG_S
+        end = time.monotonic() + HUNG_S
         while time.monotonic() < end:
             if rows(out / "wheels.csv") > 40 and rows(out / "gnss.csv") > 4 and rows(out / "baro.csv") > 4:
                 break

@@ -26,8 +26,8 @@ from vislam.live.sources import open_live
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.ticks import TicksSettings
 from vislam.sensors.toml import SensorPort, load_sensor_setup
+from waiting import HUNG_S
 
-LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 TICKS = TicksSettings(ticks_per_turn=1000, radius_m=0.05)
 M_PER_TICK = 2.0 * np.pi * 0.05 / 1000
 PORTS = {
@@ -55,9 +55,9 @@ def speeds(t_ns: int) -> np.ndarray:
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SerialConfig:
-    monkeypatch.setattr(talks, "_OLD_NS", round(LONG_S * 1e9))
+    monkeypatch.setattr(talks, "_OLD_NS", round(HUNG_S * 1e9))
     clock = BridgeClockConfig(settle_s=0.2, bin_s=0.05)
-    return SerialConfig(port=str(tmp_path / "tty"), start_s=LONG_S, reopen_s=0.05, missing_s=LONG_S, clock=clock)
+    return SerialConfig(port=str(tmp_path / "tty"), start_s=HUNG_S, reopen_s=0.05, missing_s=HUNG_S, clock=clock)
 
 
 class Machine:
@@ -70,7 +70,7 @@ class Machine:
         self.samples, self.found, self._passes = 0, list[Reading](), passes
 
     def until(self, true: Callable[[], bool]) -> None:
-        end = time.monotonic() + LONG_S
+        end = time.monotonic() + HUNG_S
         while not true():
             assert time.monotonic() < end, (self.sensors.status(), self.sensors.counters(), self.bridge.counters())
             self.samples += len(self.bridge.read(0.01))
@@ -142,7 +142,7 @@ def test_a_host_from_before_takes_the_samples_of_a_new_sketch(
         monkeypatch.delitem(protocol._READERS, kind)
     with BridgeEmulator(Path(config.port), at_rest, turned=turned) as board:
         bridge = SerialBridge(config)
-        samples, end = 0, time.monotonic() + LONG_S
+        samples, end = 0, time.monotonic() + HUNG_S
         while samples < 400:
             assert time.monotonic() < end
             samples += len(bridge.read(0.05))
@@ -157,7 +157,7 @@ def test_a_host_from_before_takes_the_samples_of_a_new_sketch(
 def test_a_sketch_with_encoders_and_nobody_who_asks_for_them(config: SerialConfig) -> None:
     with BridgeEmulator(Path(config.port), at_rest, turned=turned):
         bridge = SerialBridge(config)
-        end = time.monotonic() + LONG_S
+        end = time.monotonic() + HUNG_S
         while bridge.counters().get("counts_frames", 0) < 20:
             assert time.monotonic() < end
             bridge.read(0.05)
@@ -262,7 +262,7 @@ def test_a_cart_opens_both_ends_of_its_bridge(tmp_path: Path, config: SerialConf
     cart, _ = open_live("serial+none", Config(), replace(SensorsConfig(), serial=config))
     with BridgeEmulator(Path(config.port), at_rest, turned=turned, has_receiver=True):
         readings, bridge = cart.readings(setup)(), cart.inertial()()
-        found, end = list[Reading](), time.monotonic() + LONG_S
+        found, end = list[Reading](), time.monotonic() + HUNG_S
         while not found:
             assert time.monotonic() < end, readings.status()
             bridge.read(0.02)

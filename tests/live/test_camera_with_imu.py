@@ -22,8 +22,8 @@ from vislam.live.handed_imu import HandedImu, ImuHander
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
 from vislam.runs.folder import prepare
+from waiting import HUNG_S
 
-LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 AMPLITUDE_M, PERIOD_S = 0.25, 3.0
 CAMERA = RealsenseConfig(rate_hz=15.0, reopen_s=0.1, start_s=60.0)
 SENSORS = replace(SensorsConfig(), realsense=CAMERA)
@@ -58,7 +58,7 @@ class Drive:
     """What is done to the device, as the run goes on; says when all was seen."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.steps, self.end = folder, ["go", "unplug", "missing", "back"], time.monotonic() + LONG_S
+        self.folder, self.steps, self.end = folder, ["go", "unplug", "missing", "back"], time.monotonic() + HUNG_S
         self.samples = 0
 
     def __call__(self, run: LiveRun) -> None:
@@ -128,11 +128,11 @@ def sample(k: int) -> ImuSample:
 
 def test_samples_cross_the_wire_whole_and_in_order() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    hander, imu = ImuHander(ours), HandedImu(theirs, 200.0, LONG_S)
+    hander, imu = ImuHander(ours), HandedImu(theirs, 200.0, HUNG_S)
     with closing(imu):
         hander.send([sample(k) for k in range(100)])
         hander.report(Health.IMU_GAP | Health.IMU_MISSING, {"gaps": 1}, "")
-        read = imu.read(LONG_S)
+        read = imu.read(HUNG_S)
         assert [value.t_ns for value in read] == [1000 * k for k in range(100)]
         assert isinstance(read[7], ImuSample)
         assert read[7].accel_m_s2.tolist() == [-7.0] * 3
@@ -168,14 +168,14 @@ def test_frames_cross_shared_memory_as_they_are(with_depth: bool) -> None:
     with closing(FrameHander(name, 16, 12, with_depth)) as hander, closing(HandedFrames(name, 0.0)) as frames:
         assert frames.read(0.0) is None
         hander.hand(frame, {"captured": 8, "lost": 2})
-        read = frames.read(LONG_S)
+        read = frames.read(HUNG_S)
         assert read is not None
         assert (read.t_ns, read.index, len(read.images)) == (5, 7, len(frame.images))
         assert all(np.array_equal(a, b) for a, b in zip(read.images, frame.images, strict=True))
         assert (read.color is not None) == (read.depth_m is not None) == with_depth
         assert not with_depth or np.array_equal(read.depth_m, depth)
         hander.hand(replace(frame, index=10), {"captured": 11})
-        assert frames.read(LONG_S) is not None
+        assert frames.read(HUNG_S) is not None
         assert frames.counters() == {"captured": 11, "replaced": 2, "taken": 2, "wrong_size": 0}
         hander.hand(Frame(6, 11, tuple(np.zeros((99, 99), np.uint8) for _ in range(2))), {"captured": 12})
         assert frames.read(0.0) is None

@@ -18,8 +18,8 @@ from vislam.hw.talks import LineTalk
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.ticks import TicksSettings
 from vislam.sensors.toml import SensorPort, load_sensor_setup
+from waiting import HUNG_S
 
-LONG_S = 600.0  # how long a test waits for what must come; never how long it takes
 TICKS = TicksSettings(ticks_per_turn=1000, radius_m=0.05, bits=16)
 M_PER_TICK = 2.0 * np.pi * 0.05 / 1000
 MS = 1_000_000
@@ -106,7 +106,7 @@ def test_counters_that_jump_or_pause_give_no_speed_and_say_why() -> None:
 @pytest.fixture
 def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Receiver]:
     monkeypatch.setattr(reading_port, "_REOPEN_S", 0.02)
-    monkeypatch.setattr(talks, "_OLD_NS", round(LONG_S * 1e9))
+    monkeypatch.setattr(talks, "_OLD_NS", round(HUNG_S * 1e9))
     device = Receiver(tmp_path / "tty")
     yield device
     device.unplug()
@@ -117,7 +117,7 @@ def test_encoders_are_unplugged_and_begin_anew(device: Receiver) -> None:
     found: list[Reading] = []
 
     def until(true: Callable[[], bool], say: bytes = b"") -> None:
-        end = time.monotonic() + LONG_S
+        end = time.monotonic() + HUNG_S
         while not true():
             assert time.monotonic() < end, (sensors.status(), sensors.counters())
             if say:

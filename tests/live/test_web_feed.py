@@ -19,8 +19,7 @@ from vislam.live.web.updates import FrameUpdate, KeyframeCloud, LoopUpdate, MapU
 from vislam.live.wire.mail import Inbox
 from vislam.live.wire.published_pose import NO_VISION_MS, PublishedPose
 from vislam.mapping.formats.ply import read_ply
-
-HANG_S = 300.0  # a limit that only ends a hang
+from waiting import HUNG_S
 
 
 def cloud(count: int) -> KeyframeCloud:
@@ -201,7 +200,7 @@ def test_nobody_waits_for_a_page_that_takes_nothing_and_no_memory_is_spent_on_it
     inbox, waiting = Inbox(hears_map), []
     while sum(told.left_out for told in waiting) == 0:  # what was sent before the page fell behind comes first
         shared.flush()
-        waiting += [told] if (told := inbox.get(HANG_S)) is not None else []
+        waiting += [told] if (told := inbox.get(HUNG_S)) is not None else []
     assert max(len(told.clouds) for told in waiting) <= 64
 
 
@@ -232,7 +231,7 @@ def test_points_of_a_keyframe_come_from_its_depth_where_it_has_some_and_the_save
     shared = MapShare(wire, tmp_path)
     shared.take([keyframe_step(1)], mapper)
     inbox = Inbox(page)
-    told = inbox.get(HANG_S)
+    told = inbox.get(HUNG_S)
     assert told.clouds[1].xyz.tolist() == [[500, 500, 500]] * 4
     page.send((0, Save()))
     saved = answer(shared, inbox, mapper)

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from vislam.core.geometry import invert, se3_exp, transform, transform_points
@@ -20,7 +19,6 @@ from vislam.core.messages import (
     VoMeasurement,
 )
 from vislam.imu import ImuNoise
-from vislam.sim.motion.path import rounded_path
 from worlds.fake_window import FakeWindow
 from worlds.lap import EUROC_NOISE, LAP_S, T_BODY_CAM0, position, rotation
 from worlds.parts import EUROC_CAMERA, along_x, bare_keyframe, derivative, ideal_imu, on_walls, rig_of
@@ -144,27 +142,6 @@ class LapWorld:
         ids = np.array([live[i] for i in chosen.tolist()], dtype=np.int64)
         noise = self.rng.normal(size=(2, len(chosen), 2)) * 1.0
         return Observations(ids, left[chosen] + noise[0], right[chosen] + noise[1] * np.array([0.5, 1.0]))
-
-
-def cart_round(lap_s: float = 40.0) -> tuple[Path, Turn, float]:
-    """Return one round through the hall of `workshop-cart` as a motion of `LapWorld`: it heads where it drives."""
-    path = rounded_path(
-        [(-4.55, -2.65), (4.55, -2.65), (4.55, 2.65), (-4.55, 2.65), (-4.55, -2.65), (0.0, -2.65)], 1.05
-    )
-    begin_m, end_m = 4.55, path.length_m  # both in the middle of the first side, one round apart
-    t = np.linspace(0.0, lap_s, 81)
-    xy, heading = path.at(begin_m + (end_m - begin_m) * t / lap_s)
-    xy[-1] = xy[0]
-    way = CubicSpline(t, np.column_stack([xy, np.full(len(t), 0.3)]), bc_type="periodic")
-    turn = np.unwrap(heading) - 2.0 * np.pi * t / lap_s
-    turn[-1] = turn[0]
-    rest = CubicSpline(t, turn, bc_type="periodic")
-
-    def rotation(s: Array) -> Rotation:
-        yaw = rest(np.mod(s, lap_s)) + 2.0 * np.pi * s / lap_s
-        return Rotation.from_euler("z", yaw[:, None])
-
-    return lambda s: way(np.mod(s, lap_s)), rotation, lap_s
 
 
 def window_of_truth(world: LapWorld, count: int) -> FakeWindow:
