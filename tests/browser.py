@@ -1,5 +1,8 @@
 """How tests start a browser, and what they ask of every page: no text is cut, none is too small to read."""
 
+from waiting import HUNG_S
+
+PATIENCE_MS = 1000.0 * HUNG_S
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -27,6 +30,7 @@ PAPER_PX = 703  # between the margins of A4
 def is_readable_on_a_phone_and_on_paper(chromium, path) -> None:
     """On a phone no letter is smaller than 11 px; on paper no table is cut and no heading stands alone."""
     page = chromium.new_page(viewport={"width": 400, "height": 900})
+    page.set_default_timeout(PATIENCE_MS)
     page.goto(path.resolve().as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") == 400
     assert page.evaluate(CUT) == []

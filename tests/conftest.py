@@ -22,7 +22,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.internal.conjecture import providers
 
-from browser import FLAGS
+from browser import FLAGS, PATIENCE_MS
 from needs import missing
 from vislam.config import CalibrationConfig
 from vislam.sim.scene import Scene
@@ -150,6 +150,6 @@ def chromium() -> Iterator[Any]:
     if path is None:
         missing("chromium is not installed (Debian: apt install chromium)")
     with sync.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=PATIENCE_MS)
         yield browser
         browser.close()

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from browser import CUT, SMALLEST
+from browser import CUT, PATIENCE_MS, SMALLEST
+from waiting import HUNG_S
 
-_PATIENCE_MS = 400_000
 _WORLD = "replay:points:laps,rig=rgbd,camera_hz=10,duration_s=600"
-_NO_EXIT_S = 300
 
 
 class Live:
@@ -36,7 +35,7 @@ class Live:
 
     def ended(self) -> int:
         """Return the exit code when it ends."""
-        self.process.communicate(timeout=_NO_EXIT_S)
+        self.process.communicate(timeout=HUNG_S)
         return self.process.returncode
 
     def kill(self) -> None:
@@ -61,7 +60,7 @@ def opened(chromium, url: str, width: int = 1400, scheme: str = "light"):
     """Return a page that has signed in, and what goes wrong in it."""
     context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, has_touch=width < 500)
     page = context.new_page()
-    page.set_default_timeout(_PATIENCE_MS)
+    page.set_default_timeout(PATIENCE_MS)
     faults: list[str] = []
     page.on("pageerror", lambda error: faults.append(str(error)))
     page.goto(url)

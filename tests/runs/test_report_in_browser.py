@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import CUT, NO_WEBGL, SMALLEST, is_readable_on_a_phone_and_on_paper
+from browser import CUT, NO_WEBGL, PATIENCE_MS, SMALLEST, is_readable_on_a_phone_and_on_paper
 from run_folder import LOST, PERIOD_NS, make_run
 from vislam.cli import run_verb
 from vislam.loop import loops_text, read_loops
@@ -17,7 +17,6 @@ from vislam.mapping.semantic.layer_files import write_layer
 from vislam.mapping.semantic.votes import voxel_keys
 from vislam.runs.report import write_report
 
-PATIENCE_MS = 120_000
 COLORS = """() => {
     const view = window.vislamReport.view, gl = view.renderer.getContext();
     view.rest(); view.draw();
