@@ -80,6 +80,7 @@ class FailuresAtOnce:
             self._terminal.write_line(f"FAILED {report.nodeid} ({report.when})\n{report.longreprtext}")
 
 
+@pytest.hookimpl(trylast=True)  # after the reporter is there
 def pytest_configure(config: pytest.Config) -> None:
     """Have failures printed at once by the process that prints."""
     if terminal := config.pluginmanager.get_plugin("terminalreporter"):
