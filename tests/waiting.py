@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import psutil
+
 from vislam.runs.record import Recorded
 
 HUNG_S = 600.0  # only ends a hang; nothing waits so long otherwise
@@ -18,6 +20,14 @@ def wait_for(condition: Callable[[], Found], what: Callable[[], object] = lambda
         assert time.monotonic() < end_s, f"waited in vain for {what()}"
         time.sleep(0.005)
     return found
+
+
+def is_gone(process: psutil.Process) -> bool:
+    """Return whether a process has ended; whoever inherited it may not have asked for its exit code yet."""
+    try:
+        return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+    except psutil.Error:
+        return True
 
 
 def until_it_holds(frames: int = 0, imu: int = 0) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import pytest
 from vislam.core.interrupts import EXIT_CODE, SIGNALS
 from vislam.runs.folder import prepare
 from vislam.runs.session import Session, has_frames
-from waiting import HUNG_S
+from waiting import HUNG_S, is_gone, wait_for
 
 SEED = 9
 
@@ -158,8 +158,7 @@ def test_workers_of_a_cluster_end_with_their_parent(tmp_path: Path) -> None:
         return len(workers) == 2 and all(cpu_s(worker) > 3.0 for worker in workers)
 
     check(interrupted(arguments, works, signal.SIGINT), signal.SIGINT, "while workers solve")
-    _, left = psutil.wait_procs(workers, timeout=HUNG_S)
-    assert left == []
+    wait_for(lambda: all(map(is_gone, workers)))
     assert not (tmp_path / "out" / "optimized.g2o").exists()
 
 
