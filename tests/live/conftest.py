@@ -8,14 +8,16 @@ import pytest
 from live_runs import PATIENCE_S, begin, has_map, interrupt, left_behind, until
 
 from vislam.live import run_live
+from waiting import HUNG_S
 from worlds.shared import shared
 
 
 @pytest.fixture(autouse=True, scope="session")
 def patient_end() -> Iterator[None]:
-    """Let a run write down what there is after a signal, on however slow a machine; tests that hurry state it."""
+    """Let a run write down what there is after a signal or failure, on however slow a machine; who hurries says so."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_live, "_BRIEF_S", 600.0)
+        patch.setattr(run_live, "_BRIEF_S", HUNG_S)
+        patch.setattr(run_live, "_AFTER_FAILURE_S", HUNG_S)
         yield
 
 

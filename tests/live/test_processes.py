@@ -1,11 +1,14 @@
 """Whole live runs in real processes, on simulated vision played in real time; nothing here asserts how long it took."""
 
+import atexit
 import errno
 import json
 import os
 import signal
+import time
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,12 +25,11 @@ from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
 from vislam.runs.folder import prepare
 from vislam.runs.session import Session
-
-_WORLD = "points:laps,rig=rgbd,camera_hz=10,duration_s=16"
+from waiting import HUNG_S
 
 
 def start(
-    tmp_path: Path, name: str, outages: Outages | None = None, world: str = _WORLD, **others: object
+    tmp_path: Path, name: str, outages: Outages | None = None, world: str = WORLD, **others: object
 ) -> tuple[LiveRun, Path]:
     out = tmp_path / name
     prepare(out, overwrite=False)
@@ -100,7 +102,7 @@ def test_an_interrupt_does_not_wait_for_a_slow_end_and_the_session_is_kept(
     monkeypatch.setattr(run_live, "_BRIEF_S", 0.0)
     live, out = start(tmp_path, "hurried")
     with pytest.raises(KeyboardInterrupt):
-        live.execute(until(has_map, interrupt))
+        live.execute(until(has_map, interrupt), PATIENCE_S)
     assert live.is_brief and not (out / "metrics.json").exists()
     assert left_behind("hurried") == []
     with closing(Session(out / "session.db")) as session:
@@ -118,7 +120,7 @@ def test_a_killed_process_ends_the_run_with_its_name(role: str, tmp_path: Path) 
             process.kill()
 
     with pytest.raises(HardwareError, match=f"the {role} process was killed by signal 9"):
-        live.execute(kill)
+        live.execute(kill, PATIENCE_S)
     assert (out / "session.db").is_file()
     if role != "map":
         assert (out / "metrics.json").is_file()
@@ -129,14 +131,37 @@ def test_what_a_process_raises_comes_home_whole(tmp_path: Path) -> None:
     """One camera without motion never sees scale: the front half gives up, as in a run of a recording."""
     out = tmp_path / "run"
     prepare(out, overwrite=False)
-    world = "points:still,rig=mono,camera_hz=10,duration_s=20"
+    world = f"points:still,rig=mono,camera_hz=10,duration_s={PATIENCE_S:g}"
     never_at_rest = {"view.enabled": False, "init.give_up_s": 2.0, "init.rest_s": 100.0}
     live_settings = load(None, never_at_rest | {"live.name": f"vislam-test-mono-{os.getpid()}"})
     live = LiveRun(ReplaySource(world), live_settings, out, world, ["vislam", "live"])
     with pytest.raises(TrackingLostError, match="no scale after") as caught:
-        live.execute(duration_s=20.0)
+        live.execute(duration_s=PATIENCE_S)
     assert "in the front process" in "".join(caught.value.__notes__)
     assert left_behind("mono") == []
+
+
+def lingering(open_source: Callable[[], InertialSource]) -> InertialSource:
+    """Open a source in a process that will not leave, as one whose library waits for a thread of its own."""
+    atexit.register(time.sleep, HUNG_S)
+    return open_source()
+
+
+class Lingering(ReplaySource):
+    def inertial(self) -> Callable[[], InertialSource]:
+        return partial(lingering, super().inertial())
+
+
+def test_a_process_that_has_written_all_and_does_not_leave_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_live, "_TAKING_APART_S", 0.1)
+    out = tmp_path / "lingering"
+    prepare(out, overwrite=False)
+    live = LiveRun(Lingering(WORLD), settings("lingering"), out, WORLD, ["vislam", "live"])
+    metrics = live.execute(until(has_map, LiveRun.stop), PATIENCE_S)
+    assert metrics["frames"] == json.loads((out / "metrics.json").read_text())["frames"] > 0
+    assert left_behind("lingering") == []
 
 
 def no_board() -> InertialSource:
@@ -153,7 +178,7 @@ class Boardless(ReplaySource):
 def test_a_sensor_that_is_missing_ends_the_run_before_it_began_and_the_next_try_is_not_refused(tmp_path: Path) -> None:
     out = tmp_path / "boardless"
     prepare(out, overwrite=False)
-    live = LiveRun(Boardless(_WORLD), settings("boardless"), out, _WORLD, ["vislam", "live"])
+    live = LiveRun(Boardless(WORLD), settings("boardless"), out, WORLD, ["vislam", "live"])
     with log_to(out, ["vislam", "live"]), pytest.raises(BusError, match="it cannot be opened") as caught:
         live.execute()
     assert caught.value.exit_code == HardwareError.exit_code and caught.value.kind == "gone"
@@ -172,7 +197,7 @@ def test_an_interrupt_before_the_sensors_are_read_ends_it_at_once(tmp_path: Path
 
 def test_a_setting_for_recordings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"ekf\.graph_feedback"):
-        LiveRun(ReplaySource(_WORLD), load(None, {"ekf.graph_feedback": True}), tmp_path, _WORLD, [])
+        LiveRun(ReplaySource(WORLD), load(None, {"ekf.graph_feedback": True}), tmp_path, WORLD, [])
 
 
 def test_a_source_without_inertial_data_is_refused() -> None:

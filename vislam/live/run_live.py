@@ -41,6 +41,7 @@ _LOG = logging.getLogger(__name__)
 _WATCH_S = 0.1
 _WRITERS = ("fast", "front", "back", "map")
 _BRIEF_S = 1.3  # after a signal, that writing down what there is may take
+_TAKING_APART_S = 10.0  # that a process with nothing left to write may take to leave
 _AFTER_FAILURE_S = 60.0  # that the others may take to write down what there is
 
 
@@ -309,12 +310,12 @@ class LiveRun:
             self._watch(show)
             if asked.count > self.is_brief:
                 raise KeyboardInterrupt
-            if self.is_brief and all("cost" in self.notes.get(role, {}) for role in _WRITERS):
-                break  # they have sent all, and to take a process apart takes time
-            if self._failure is not None:
+            if all("cost" in self.notes.get(role, {}) for role in _WRITERS):  # they have sent all
+                patience = min(patience, time.monotonic() + (0.0 if self.is_brief else _TAKING_APART_S))
+            if self._failure is not None:  # a killed process may have held what the others wait for
                 patience = min(patience, time.monotonic() + _AFTER_FAILURE_S)
-            if time.monotonic() > patience:
-                break  # a killed process may have held what the others wait for
+            if time.monotonic() >= patience:
+                break
         self._watch(show)
 
     def _start(self) -> None:
