@@ -86,7 +86,8 @@ def main(arguments: list[str]) -> int:
             with lock:
                 done += max(0, waiting[name].kernels - counted)
             if process.returncode == 0:
-                _set_done(name, stamp)
+                with suppress(OSError):
+                    _place(name).write_text(stamp, encoding="ascii")
             return process.returncode
 
         codes = list(threads.map(work, waiting))
@@ -131,11 +132,6 @@ def _is_done(name: str, stamp: str) -> bool:
     with suppress(OSError):
         return _place(name).read_text(encoding="ascii") == stamp
     return False
-
-
-def _set_done(name: str, stamp: str) -> None:
-    with suppress(OSError):
-        _place(name).write_text(stamp, encoding="ascii")
 
 
 if __name__ == "__main__":

@@ -1,26 +1,37 @@
-"""Reports when numba compiles while a user waits."""
+"""Reports when numba compiles while a user waits; it is not loaded for that, `jit` brings the listeners with it."""
 
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 _WORTH_SAYING_S = 1.0  # of CPU: a kernel or two for new kinds of arguments are no reason for a message
+_waiting = list[Any]()  # listeners that numba does not know yet
 
 
 def on_compilation(say: Callable[[], None]) -> None:
     """Call `say` once, when numba has compiled for a second from now on; what is read from the cache does not count."""
-    from numba.core import event
-
-    event.Listener.register(_Listener)  # no subclass, for numba is imported here only
-    event.register("numba:compile", _Listener(say))
+    _listen(_Listener(say))
 
 
 def on_each_kernel(say: Callable[[str], None]) -> None:
     """Call `say` with the name of every kernel of vislam that is compiled, when it is."""
+    _listen(_Each(say))
+
+
+def _listen(listener: Any) -> None:
+    _waiting.append(listener)
+    if "numba" in sys.modules:
+        register_listeners()
+
+
+def register_listeners() -> None:
+    """Have numba, which is loaded, notify those who were to be called."""
     from numba.core import event
 
-    event.Listener.register(_Each)
-    event.register("numba:compile", _Each(say))
+    while _waiting:
+        event.Listener.register(type(_waiting[-1]))  # no subclass, for numba is imported here only
+        event.register("numba:compile", _waiting.pop())
 
 
 class _Each:
@@ -48,15 +59,12 @@ class _Listener:
         if self._say is None:
             return
         now_s = time.process_time()
-        if event.is_start:
-            if self._depth == 0:
-                self._begun_s = now_s
-            self._depth += 1
+        if self._depth == 0:
+            self._begun_s = now_s
+        self._depth += 1 if event.is_start else -1
         compiled_s = self._before_s + now_s - self._begun_s
-        if event.is_end:
-            self._depth -= 1
-            if self._depth == 0:
-                self._before_s = compiled_s
+        if self._depth == 0:
+            self._before_s = compiled_s
         if compiled_s > _WORTH_SAYING_S:
             say, self._say = self._say, None
             say()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +16,7 @@ from vislam.cli.verbs.brief import Brief
 from vislam.cli.verbs.terminal import number, print_table, progress_bar
 from vislam.config import SensorsConfig, load_sensors
 from vislam.config.ranges import Range
+from vislam.core.collector import while_importing
 from vislam.core.errors import DataError, HardwareError, UsageError, printable
 
 if TYPE_CHECKING:
@@ -73,8 +73,8 @@ def main(arguments: list[str]) -> int:
 def _examine_recording(options: DoctorOptions) -> int:
     if options.i2c or options.serial or options.camera or options.imu:
         raise UsageError(f"doctor examines {options.source} or the sensors of this machine, not both; leave one out")
-    from vislam.datasets.inspect import inspect
-
+    with while_importing():
+        from vislam.datasets.inspect import inspect
     with progress_bar("examined", "images") as bar:
         inspection = inspect(options.source, bar)
     if options.masks is not None:
@@ -133,7 +133,8 @@ def _print_inspection(inspection: Inspection) -> None:
     size = f"{inspection.duration_s:.1f} s, {inspection.size_bytes / 1e6:.1f} MB"
     Console().print(f"{printable(inspection.source)}: {inspection.format}, {size}", soft_wrap=True)
     topics = [
-        (t.name, t.type.replace("/msg/", "/"), str(t.count), _rate(t.rate_hz), t.taken_for) for t in inspection.topics
+        (t.name, t.type.replace("/msg/", "/"), str(t.count), f"{t.rate_hz:.1f}".strip("na"), t.taken_for)
+        for t in inspection.topics
     ]
     if topics:
         words = ("topic", "type", "taken for")
@@ -141,10 +142,6 @@ def _print_inspection(inspection: Inspection) -> None:
     rows = [(s.name, str(s.count), f"{s.rate_hz:.1f}", f"{s.longest_gap_s:.3f}") for s in inspection.streams]
     print_table(("stream", "count", "rate [Hz]", "longest gap [s]"), rows)
     _print_findings(inspection.findings)
-
-
-def _rate(rate_hz: float) -> str:
-    return "" if math.isnan(rate_hz) else number(rate_hz, 1)
 
 
 def _print_findings(findings: Sequence[Finding]) -> None:
