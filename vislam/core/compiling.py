@@ -1,37 +1,26 @@
-"""Reports when numba compiles while a user waits; it is not loaded for that, `jit` brings the listeners with it."""
+"""Reports when numba compiles while a user waits."""
 
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 _WORTH_SAYING_S = 1.0  # of CPU: a kernel or two for new kinds of arguments are no reason for a message
-_waiting = list[Any]()  # listeners that numba does not know yet
 
 
 def on_compilation(say: Callable[[], None]) -> None:
     """Call `say` once, when numba has compiled for a second from now on; what is read from the cache does not count."""
-    _listen(_Listener(say))
+    from numba.core import event
+
+    event.Listener.register(_Listener)  # no subclass, for numba is imported here only
+    event.register("numba:compile", _Listener(say))
 
 
 def on_each_kernel(say: Callable[[str], None]) -> None:
     """Call `say` with the name of every kernel of vislam that is compiled, when it is."""
-    _listen(_Each(say))
-
-
-def _listen(listener: Any) -> None:
-    _waiting.append(listener)
-    if "numba" in sys.modules:
-        register_listeners()
-
-
-def register_listeners() -> None:
-    """Have numba, which is loaded, notify those who were to be called."""
     from numba.core import event
 
-    while _waiting:
-        event.Listener.register(type(_waiting[-1]))  # no subclass, for numba is imported here only
-        event.register("numba:compile", _waiting.pop())
+    event.Listener.register(_Each)
+    event.register("numba:compile", _Each(say))
 
 
 class _Each:

@@ -13,7 +13,6 @@ from typing import Any
 import numba
 from numba.core import config, event
 
-from vislam.core.compiling import register_listeners
 from vislam.core.numba_internals import replace_internals, stamp_with_callees
 
 
@@ -59,4 +58,3 @@ class _Quicker(event.Listener):  # type: ignore[misc]
 
 replace_internals()
 event.register("numba:compile", _Quicker())
-register_listeners()

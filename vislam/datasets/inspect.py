@@ -86,10 +86,6 @@ class Inspection:
         return worst(self.findings)
 
 
-def _camera_of(rig: Rig | None, index: int) -> Camera | None:
-    return rig.cameras[index] if rig is not None and index < len(rig.cameras) else None
-
-
 def inspect(uri: str, progress: Progress = silent) -> Inspection:
     """Examine `FORMAT:PATH` or a bare path; `progress` takes what is done, of how much, and of what.
 
@@ -179,7 +175,8 @@ class _Inspector:
             self._check_stream(images.name, images.t_ns)
             if found.video is None and found.streams is None:
                 is_depth = images is found.depth
-                camera = _camera_of(found.rig, 0 if is_depth else index)
+                cameras = () if found.rig is None else found.rig.cameras
+                camera = next(iter(cameras[0 if is_depth else index :]), None)
                 stored = found.depth_format.camera(camera) if is_depth and camera is not None else camera
                 self._check_images(images, stored, depth_rows if is_depth else None)
         self._size_bytes += sum(path.stat().st_size for path in found.videos)

@@ -16,7 +16,6 @@ from vislam.cli.verbs.brief import Brief
 from vislam.cli.verbs.terminal import number, print_table, progress_bar
 from vislam.config import SensorsConfig, load_sensors
 from vislam.config.ranges import Range
-from vislam.core.collector import while_importing
 from vislam.core.errors import DataError, HardwareError, UsageError, printable
 
 if TYPE_CHECKING:
@@ -73,8 +72,8 @@ def main(arguments: list[str]) -> int:
 def _examine_recording(options: DoctorOptions) -> int:
     if options.i2c or options.serial or options.camera or options.imu:
         raise UsageError(f"doctor examines {options.source} or the sensors of this machine, not both; leave one out")
-    with while_importing():
-        from vislam.datasets.inspect import inspect
+    from vislam.datasets.inspect import inspect
+
     with progress_bar("examined", "images") as bar:
         inspection = inspect(options.source, bar)
     if options.masks is not None:
