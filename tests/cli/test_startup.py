@@ -2,14 +2,15 @@
 
 import subprocess
 import sys
-from functools import cache
+
+import pytest
 
 from vislam.cli.verbs import VERBS
 
 HEAVY = {"numpy", "scipy", "numba", "cv2", "gtsam", "matplotlib", "open3d", "rerun"}
+KERNELS = {"numpy", "scipy", "numba"}
 
 
-@cache
 def modules_after(script: str) -> set[str]:
     """Return the modules that a fresh interpreter has loaded when the script has run."""
     tail = "import sys; print(*sys.modules, file=sys.stderr)"
@@ -17,20 +18,21 @@ def modules_after(script: str) -> set[str]:
     return set(done.stderr.splitlines()[-1].split())
 
 
-def test_the_pipeline_loads_no_statistics_pictures_or_viewers() -> None:
-    loaded = modules_after("import vislam.slam")
-    assert "gtsam" in loaded
-    strangers = {"scipy.stats", "scipy.interpolate", "matplotlib", "rerun", "open3d", "pydantic", "tyro", "rich"}
-    assert not strangers & loaded
+LOADED = {  # by script: what it uses of HEAVY, and what else it must not load
+    "import vislam": (set(), set()),
+    # typeddict: a signature on a decorator compiles, and brings the whole of numba's registry: half a second
+    "import vislam.slam": (KERNELS | {"cv2", "gtsam"}, {"scipy.stats", "scipy.interpolate", "pydantic",
+                           "tyro", "rich", "numba.typed.typeddict"}),
+    "import vislam.runs.offline.optimize_graph, vislam.runs.report.graph_page": (KERNELS, {"vislam.slam"}),
+    "import vislam.datasets.rgbd": (KERNELS | {"cv2"}, {"scipy.optimize"}),
+    "import vislam.runs.folder": (KERNELS | {"cv2"}, {"vislam.mapping.products", "vislam.frontend", "vislam.datasets"}),
+}  # fmt: skip
 
 
-def test_the_package_itself_loads_nothing_heavy() -> None:
-    assert not HEAVY & modules_after("import vislam")
-
-
-def test_no_kernel_is_compiled_or_read_from_its_cache_by_an_import() -> None:
-    """A signature on a decorator does that, and brings the whole of numba's registry along: half a second."""
-    assert "numba.typed.typeddict" not in modules_after("import vislam.slam")
+@pytest.mark.parametrize("script", LOADED)
+def test_what_is_heavy_and_not_used_is_not_loaded(script: str) -> None:
+    loaded, (used, strangers) = modules_after(script), LOADED[script]
+    assert (loaded & HEAVY, loaded & strangers) == (used, set())
 
 
 def test_verbs_answer_for_help_before_they_load_anything_heavy() -> None:
@@ -49,9 +51,3 @@ for verb in {list(VERBS)}:
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == ""
-
-
-def test_a_pose_graph_file_loads_neither_the_pipeline_nor_what_draws() -> None:
-    loaded = modules_after("import vislam.runs.offline.optimize_graph, vislam.runs.report.graph_page")
-    assert not (HEAVY - {"numpy", "scipy", "numba"}) & loaded
-    assert "vislam.slam" not in loaded

@@ -18,7 +18,7 @@ from vislam.core.geometry import so3_exp
 from vislam.core.messages import Frame
 from vislam.datasets import open_dataset, survey
 from vislam.datasets.calibration import DepthFile, parse_depth
-from vislam.datasets.images import DepthFormat
+from vislam.datasets.images import DepthFormat, read_raw_depth
 from vislam.datasets.inspect import inspect
 from vislam.datasets.recorder import record
 from vislam.datasets.rgbd import RgbdFacts, rgbd_facts, rgbd_faults
@@ -216,14 +216,18 @@ def test_only_what_is_wrong_and_sure_is_accused(found: RgbdFacts, what: list[str
     assert [fault.what for fault in rgbd_faults(found, 640)] == what
 
 
-def test_doctor_tells_of_saturated_depth_and_of_what_it_cannot_tell(tmp_path: Path) -> None:
+def test_doctor_tells_of_saturated_depth_and_of_what_it_cannot_tell(tmp_path: Path, monkeypatch) -> None:
     folder = write_tum(tmp_path / "my_kinect", (64, 48))
     (folder / "sensor.yaml").write_text(camera_yaml())
     for path in (folder / "depth").iterdir():
         raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         raw[:10] = 65535
         cv2.imwrite(str(path), raw)
+    read: list[str] = []
+    reading = lambda path, lens: (read.append(path.name), read_raw_depth(path, lens))[1]  # noqa: E731
+    monkeypatch.setattr("vislam.datasets.images.read_raw_depth", reading)
     said = {finding.what: finding.severity for finding in inspect(str(folder)).findings}
+    assert read == ["0.png", "2.png", "3.png"]  # each once, though two examinations want them
     assert said["depth 65535 in 20.8% of the pixels means that nothing was measured"] == "warning"
     assert any(what.startswith("colour and depth do not show offset or lag or focal length") for what in said)
 

@@ -3,6 +3,7 @@
 Exit codes: 0 done, 2 usage, 3 input or data, 4 tracking lost or a quality gate failed, 5 hardware, 130 interrupted.
 """
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -19,11 +20,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a verb and leave the process with its exit code, soon after a signal that asks for it."""
+    gc.set_threshold(
+        50_000, 20, 50
+    )  # modules make 200,000 objects that live on, over which it would go again and again
     with interrupts.bounded():
         code = run_verb(list(sys.argv[1:] if arguments is None else arguments))
         if interrupts.has_come():
             interrupts.leave(code)
         _let_go_of_output()
+        gc.freeze()  # the end of the process looks for garbage among all that is not frozen
         sys.exit(code)
 
 

@@ -19,11 +19,3 @@ def paused() -> Iterator[None]:
     finally:
         if was_enabled:
             gc.enable()
-
-
-@contextmanager
-def while_importing() -> Iterator[None]:
-    """Do not look for cyclic garbage meanwhile, and never again among what is there afterwards: modules live on."""
-    with paused():
-        yield
-        gc.freeze()

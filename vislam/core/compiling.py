@@ -48,15 +48,12 @@ class _Listener:
         if self._say is None:
             return
         now_s = time.process_time()
-        if event.is_start:
-            if self._depth == 0:
-                self._begun_s = now_s
-            self._depth += 1
+        if self._depth == 0:
+            self._begun_s = now_s
+        self._depth += 1 if event.is_start else -1
         compiled_s = self._before_s + now_s - self._begun_s
-        if event.is_end:
-            self._depth -= 1
-            if self._depth == 0:
-                self._before_s = compiled_s
+        if self._depth == 0:
+            self._before_s = compiled_s
         if compiled_s > _WORTH_SAYING_S:
             say, self._say = self._say, None
             say()

@@ -34,20 +34,7 @@ class _Compiling(event.Listener):  # type: ignore[misc] # numba has no types
                 self.cpu_s += took_s
 
 
-class _Taking(event.Listener):  # type: ignore[misc]
-    """Counts how often numba was asked for a kernel that is not there yet: it is compiled, or loaded from a cache."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def on_start(self, event: object) -> None:
-        self.count += 1
-
-    def on_end(self, event: object) -> None:
-        pass
-
-
-_compiling, _taking = _Compiling(), _Taking()
+_compiling, _taking = _Compiling(), event.RecordingListener()
 event.register("numba:compile", _compiling)
 event.register("numba:compiler_lock", _taking)
 _ahead_s: dict[str, float] = {}
@@ -71,7 +58,7 @@ def compile_cpu_s() -> float:
 
 def kernels_taken() -> int:
     """Return how often a kernel was called for the first time: each compiles, or waits for the disk."""
-    return _taking.count
+    return sum(taken.is_start for _, taken in _taking.buffer)
 
 
 @contextmanager

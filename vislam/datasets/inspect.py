@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import chain
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -85,10 +86,6 @@ class Inspection:
         return worst(self.findings)
 
 
-def _camera_of(rig: Rig | None, index: int) -> Camera | None:
-    return rig.cameras[index] if rig is not None and index < len(rig.cameras) else None
-
-
 def inspect(uri: str, progress: Progress = silent) -> Inspection:
     """Examine `FORMAT:PATH` or a bare path; `progress` takes what is done, of how much, and of what.
 
@@ -117,8 +114,9 @@ class _Inspector:
     def run(self, uri: str) -> Inspection:
         found = self._found
         frames = frame_table(found, self._problems) if found.cameras else None
-        self._findings += (*found.findings, *rgbd_findings(found, frames, self._progress))
-        self._check_cameras(frames)
+        findings, depth_rows = rgbd_findings(found, frames, self._progress)
+        self._findings += (*found.findings, *findings)
+        self._check_cameras(frames, depth_rows)
         facts = self._check_imu()
         if frames is not None and facts is not None:
             self._check_overlap(frames.t_ns, facts.t_ns, "IMU")
@@ -166,7 +164,7 @@ class _Inspector:
         if len(steps_s):
             self._add("ok", f"{name}: {len(t_ns)} at {rate_hz:.1f} Hz, longest gap {longest:.3f} s", name)
 
-    def _check_cameras(self, frames: FrameTable | None) -> None:
+    def _check_cameras(self, frames: FrameTable | None, depth_rows: frozenset[int]) -> None:
         found = self._found
         if not found.cameras and found.has_imu:
             self._add("ok", "no camera: it runs by the IMU and what --sensors.file names", str(found.root))
@@ -177,9 +175,10 @@ class _Inspector:
             self._check_stream(images.name, images.t_ns)
             if found.video is None and found.streams is None:
                 is_depth = images is found.depth
-                camera = _camera_of(found.rig, 0 if is_depth else index)
+                cameras = () if found.rig is None else found.rig.cameras
+                camera = next(iter(cameras[0 if is_depth else index :]), None)
                 stored = found.depth_format.camera(camera) if is_depth and camera is not None else camera
-                self._check_images(images, stored, is_depth)
+                self._check_images(images, stored, depth_rows if is_depth else None)
         self._size_bytes += sum(path.stat().st_size for path in found.videos)
         if found.streams is not None and frames is not None:
             for index, images in enumerate(found.cameras):
@@ -188,11 +187,12 @@ class _Inspector:
         if frames is not None and not len(frames.t_ns):
             self._add("error", "no frame: the cameras share no stamps", str(found.root), "synchronise the cameras")
 
-    def _check_images(self, images: ImageList, camera: Camera | None, is_depth: bool) -> None:
-        """Probe every image, decode some, and report which cannot be used."""
+    def _check_images(self, images: ImageList, camera: Camera | None, depth_rows: frozenset[int] | None) -> None:
+        """Probe all, decode some (`depth_rows` of depth are decoded already; None: colour), report what is unusable."""
         bad: dict[str, list[Path]] = {}
-        stride = max(1, len(images.files) // _DECODED_PER_CAMERA)
-        decoded = 0
+        per_decoded = len(images.files) / _DECODED_PER_CAMERA
+        stride = max(1, int(per_decoded) if depth_rows is None else ceil(per_decoded))  # what colour shows is timed
+        decoded = len(depth_rows or ())
         bits = None if camera is None else bits_of(images, camera)
         self._checks.compare(images, repeats(images))
         for i in range(len(images.files)):
@@ -204,9 +204,9 @@ class _Inspector:
                 if camera is None or bits is None:
                     continue
                 check_size_px(size, camera, path)
-                if i % stride == 0:
+                if i % stride == 0 and not (depth_rows and depth_rows.intersection(range(i, i + stride))):
                     decoded += 1
-                    if is_depth:
+                    if depth_rows is not None:
                         read_depth(path, camera, DepthFormat())
                         continue
                     until = min(i + stride, len(images.files) - 1)

@@ -26,10 +26,11 @@ from vislam.mapping.depth.image import DepthView, surface_points
 from vislam.mapping.depth.mono import LateDepth
 from vislam.mapping.drive.drive_grid import DriveGrid, DriveMap
 from vislam.mapping.drive.grid import Grid, floor_height_m, navigation_grid
+from vislam.mapping.file_names import LEVEL, SURFACES, NotLevel
 from vislam.mapping.mesh.posed import PosedView, posed_views
 from vislam.mapping.mesh.volume import Volume
 from vislam.mapping.octree import CorrectedOccupancy, Occupancy, Octree, OctreeLeaves
-from vislam.mapping.products import LEVEL, SURFACES, NotLevel, remove_products, write_products
+from vislam.mapping.products import remove_products, write_products
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.fusion import LabelFusion
 from vislam.mapping.semantic.layer import LabelLayer

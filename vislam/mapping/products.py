@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,6 +18,7 @@ from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh, poisson_mesh
 from vislam.mapping.cloud.surfels import Surfels
 from vislam.mapping.drive.grid import write_grid
+from vislam.mapping.file_names import CLASSES_NAME, FILES, NEEDS_UP, VOXELS_NAME
 from vislam.mapping.formats.gaussians import write_gaussians
 from vislam.mapping.formats.mesh_files import write_glb, write_obj
 from vislam.mapping.formats.pcd import write_pcd
@@ -26,33 +26,12 @@ from vislam.mapping.formats.ply import write_ply
 from vislam.mapping.mesh.atlas import textured
 from vislam.mapping.octree import encode_bt, encode_ot
 from vislam.mapping.semantic.layer import LabelLayer
-from vislam.mapping.semantic.layer_files import CLASSES_NAME, VOXELS_NAME, write_layer
+from vislam.mapping.semantic.layer_files import write_layer
 
 if TYPE_CHECKING:
     from vislam.mapping.mapper import Mapper
 
-FILES = {
-    "cloud": "cloud.ply", "pcd": "cloud.pcd", "octomap": "octomap.bt", "ot": "octomap.ot",
-    "grid": "grid.pgm", "drive": "drive.pgm",
-    "mesh": "mesh.ply", "glb": "mesh.glb", "obj": "mesh.obj", "poisson": "poisson.ply", "surfels": "surfels.ply",
-    "splats": "splats.ply",
-    "labels": VOXELS_NAME,
-}  # fmt: skip
-
-SURFACES = ("mesh", "glb", "obj", "poisson", "surfels", "splats")  # what a doubled wall spoils
-NEEDS_UP = ("grid", "drive")  # what means nothing in a map that is not level
-
-
-@dataclass(frozen=True, slots=True)
-class NotLevel:
-    """Why z is not known to be up: in the map, and in submaps that are not joined with it; None where it is."""
-
-    map: str | None
-    submaps: str | None
-
-
 _NO_SURFELS = "no surface was seen with dense depth by enough keyframes"
-LEVEL = NotLevel(None, None)  # z is up everywhere
 
 
 class MapProduct(Protocol):

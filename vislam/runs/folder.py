@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,8 @@ from vislam.core.messages import (
 from vislam.core.reading import read_json
 from vislam.core.revision import code_revision
 from vislam.loop import INJECTED, LoopRow, is_injected, loops_text, retrieved_text
-from vislam.mapping.products import FILES as MAP_FILES
-from vislam.mapping.semantic.layer_files import CLASSES_NAME as LABEL_CLASSES
-from vislam.pipeline.steps import KeyframeStep, Step
+from vislam.mapping.file_names import CLASSES_NAME as LABEL_CLASSES
+from vislam.mapping.file_names import FILES as MAP_FILES
 from vislam.runs.geodetic_outputs import LINES, TABLES
 from vislam.runs.loop_shifts import LoopShifts
 from vislam.runs.session import Session, has_frames
@@ -44,6 +43,9 @@ from vislam.runs.sources import recorded_path
 from vislam.trajectory import Alignment, Trajectory, write_states_csv, write_tum
 from vislam.trajectory.frames import LoggedFrames
 from vislam.trajectory.motion_numbers import motion_of
+
+if TYPE_CHECKING:
+    from vislam.pipeline.steps import KeyframeStep, Step
 
 _HASHED_FILE_BYTES = 32 * 2**20  # larger files count by name and size only: hashing video would take longer than a run
 _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}

@@ -13,7 +13,6 @@ from vislam.config import FurtherSensorsConfig
 from vislam.core.errors import DataError
 from vislam.core.files import csv_text, write_text
 from vislam.core.messages import Array, NavState
-from vislam.datasets.sensor_files import local_frame
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.measuring_frame import UP, frame_pose, frame_variables
 from vislam.sensors.toml import load_sensor_setup
@@ -35,6 +34,8 @@ def datums_of(config: FurtherSensorsConfig) -> dict[str, Geodetic]:
     """
     if config.file is None:
         return {}
+    from vislam.datasets.sensor_files import local_frame  # most runs have no such file
+
     setup = load_sensor_setup(Path(config.file))
     datums = dict(setup.datums)
     for name, file in setup.files.items():

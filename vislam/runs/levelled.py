@@ -25,8 +25,8 @@ from vislam.core.trajectory import Trajectory
 from vislam.core.up import Up, parse_up
 from vislam.datasets.stream import FileRecording
 from vislam.frontend.planar import up_in_camera
+from vislam.mapping.file_names import LEVEL, NotLevel
 from vislam.mapping.mapper import Mapper
-from vislam.mapping.products import LEVEL, NotLevel
 from vislam.mapping.upright import surest_up
 from vislam.runs.pipeline import FrontHalf
 from vislam.trajectory.gravity_mean import up_of_forces

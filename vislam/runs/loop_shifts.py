@@ -1,12 +1,17 @@
 """By how much each loop moved the map: its own share of the shift of the update that took it in."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vislam.core.memory import LoopPlace, SlamMemory
 from vislam.core.messages import Array, GraphUpdate, LoopEdge
-from vislam.pipeline.steps import KeyframeStep
+
+if TYPE_CHECKING:
+    from vislam.pipeline.steps import KeyframeStep
 
 Shift = tuple[float, float]  # m: rms over the keyframes of the map, and largest
 

@@ -100,8 +100,8 @@ def _ends(depth_m: ImageF32) -> tuple[Array, Array, Array]:
     valid = np.flatnonzero(depth_m > 0.0)
     depths = depth_m.ravel()[valid]
     ratio = depths[1:] / depths[:-1]
-    near = np.diff(valid) <= _MOST_GAP_PX
-    ends, begins = (np.flatnonzero(near & far) for far in (ratio > 1.0 + _JUMP, ratio < 1.0 / (1.0 + _JUMP)))
+    ends, begins = (np.flatnonzero(far) for far in (ratio > 1.0 + _JUMP, ratio < 1.0 / (1.0 + _JUMP)))
+    ends, begins = (at[valid[at + 1] - valid[at] <= _MOST_GAP_PX] for at in (ends, begins))
     ends, begins = (at[valid[at] // width == valid[at + 1] // width] for at in (ends, begins))
     rows, columns = np.divmod(np.concatenate([valid[ends], valid[begins + 1]]), width)
     sides = np.repeat(np.array([1, -1]), [len(ends), len(begins)])

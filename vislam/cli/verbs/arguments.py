@@ -12,7 +12,6 @@ from vislam.cli.verbs import VERBS
 from vislam.cli.verbs.brief import Brief, brief_help
 from vislam.config.moved import refuse_moved
 from vislam.config.ranges import check_ranges
-from vislam.core.collector import while_importing
 from vislam.core.compiling import on_compilation
 from vislam.core.errors import UsageError
 
@@ -64,10 +63,7 @@ def _in_one_line(box: str, verb: str) -> str:
 @cache
 def _announce_compilation(verb: str) -> None:
     """Say on stderr when this process begins to compile, and about how long that takes where it was measured."""
-    about_s = VERBS[verb.partition(" ")[0]].compile_s
-    if about_s == 0:
-        return
-    with while_importing():
+    if (about_s := VERBS[verb.partition(" ")[0]].compile_s) != 0:
         on_compilation(partial(_say_compiling, verb, about_s))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated
@@ -133,7 +132,8 @@ def _print_inspection(inspection: Inspection) -> None:
     size = f"{inspection.duration_s:.1f} s, {inspection.size_bytes / 1e6:.1f} MB"
     Console().print(f"{printable(inspection.source)}: {inspection.format}, {size}", soft_wrap=True)
     topics = [
-        (t.name, t.type.replace("/msg/", "/"), str(t.count), _rate(t.rate_hz), t.taken_for) for t in inspection.topics
+        (t.name, t.type.replace("/msg/", "/"), str(t.count), f"{t.rate_hz:.1f}".strip("na"), t.taken_for)
+        for t in inspection.topics
     ]
     if topics:
         words = ("topic", "type", "taken for")
@@ -141,10 +141,6 @@ def _print_inspection(inspection: Inspection) -> None:
     rows = [(s.name, str(s.count), f"{s.rate_hz:.1f}", f"{s.longest_gap_s:.3f}") for s in inspection.streams]
     print_table(("stream", "count", "rate [Hz]", "longest gap [s]"), rows)
     _print_findings(inspection.findings)
-
-
-def _rate(rate_hz: float) -> str:
-    return "" if math.isnan(rate_hz) else number(rate_hz, 1)
 
 
 def _print_findings(findings: Sequence[Finding]) -> None:

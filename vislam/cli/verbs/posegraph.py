@@ -12,7 +12,6 @@ from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.solving import SolvingOptions
 from vislam.cli.verbs.terminal import progress_bar
 from vislam.config import PoseGraphConfig
-from vislam.core.collector import while_importing
 from vislam.core.errors import TrackingLostError, printable
 from vislam.core.log import log_to
 
@@ -46,11 +45,10 @@ def main(arguments: list[str]) -> int:
 
 
 def _optimize(options: PoseGraphOptions, out: Path) -> int:
-    with while_importing():  # it takes longer than solving most files
-        from vislam.batch.posegraph.optimize import as_stated
-        from vislam.core.files import check_writable
-        from vislam.runs.offline.optimize_graph import optimize_graph_file
-        from vislam.runs.report.graph_page import write_graph_report
+    from vislam.batch.posegraph.optimize import as_stated
+    from vislam.core.files import check_writable
+    from vislam.runs.offline.optimize_graph import optimize_graph_file
+    from vislam.runs.report.graph_page import write_graph_report
 
     check_writable(out)  # before the work, which may take minutes
     limit = options.settings.iterations

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import se3_exp
@@ -152,6 +151,8 @@ def _best(frames: list[_Ends], blur: float, start: Array) -> Array:
     profiles = cv2.GaussianBlur(profiles, (2 * int(3 * blur) + 1, 1), blur, sigmaY=0.1, borderType=cv2.BORDER_REPLICATE)
     moves = np.vstack([one.moves for one in frames]) * _PRIOR
     given = np.concatenate([one.given_px for one in frames])
+    from scipy.optimize import minimize  # doctor does not come here
+
     reach = profiles.shape[1] // 2
     rows = np.arange(len(profiles))
     weight = _WEIGHT / float(profiles.mean())

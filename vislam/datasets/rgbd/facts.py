@@ -51,6 +51,7 @@ class RgbdFacts:
     edges: EdgeAlignment | None
     focal: FocalFit | None
     frames: int  # that were looked at
+    depth_rows: frozenset[int] = frozenset()  # of the depth images that were read
 
     @property
     def offset_px(self) -> Array:
@@ -74,7 +75,7 @@ def rgbd_facts(found: Survey, rig: Rig, frames: FrameTable, progress: Progress =
     seen = walk(found, rig, frames, progress)
     edges = align_edges(seen.ends)
     focal = _focal(found, rig, frames, seen, edges)
-    return RgbdFacts(odd, valid_share, median_m, edges, focal, seen.frames)
+    return RgbdFacts(odd, valid_share, median_m, edges, focal, seen.frames, seen.depth_rows)
 
 
 def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, float]:

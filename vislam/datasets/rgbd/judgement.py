@@ -9,7 +9,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
-from vislam.core.progress import Progress, silent
+from vislam.core.progress import Progress
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.rgbd.facts import RgbdFacts, rgbd_facts
 from vislam.datasets.stream import Survey
@@ -111,15 +111,15 @@ def offset_words(offset_px: np.typing.NDArray[np.float64]) -> str:
     return f"{abs(dx):.1f} px {'right' if dx > 0.0 else 'left'} and {abs(dy):.1f} px {'down' if dy > 0.0 else 'up'}"
 
 
-def rgbd_findings(found: Survey, frames: FrameTable | None, progress: Progress = silent) -> list[Finding]:
-    """Return what `vislam doctor` reports of colour against depth; nothing without depth or calibration."""
+def rgbd_findings(found: Survey, frames: FrameTable | None, progress: Progress) -> tuple[list[Finding], frozenset[int]]:
+    """Return what doctor reports of depth and the rows of images that it read; nothing without depth or calibration."""
     rig = found.rig
     if rig is None or found.depth is None or frames is None or not np.any(frames.depth_rows >= 0):
-        return []
+        return [], frozenset()
     try:
         facts = rgbd_facts(found, rig, frames, progress)
     except DataError as error:
-        return [Finding("error", str(error), "depth0", "see docs/formats.md")]
+        return [Finding("error", str(error), "depth0", "see docs/formats.md")], frozenset()
     faults = rgbd_faults(facts, rig.cameras[0].width)
     out = [Finding("warning", fault.text, "depth0", fault.next_step) for fault in faults]
     wrong = {fault.what for fault in faults}
@@ -138,4 +138,4 @@ def rgbd_findings(found: Survey, frames: FrameTable | None, progress: Progress =
     if unknown:
         text = f"colour and depth do not show {' or '.join(unknown)}: too little motion, texture or foreground"
         out.append(Finding("ok", text, "depth0"))
-    return out
+    return out, facts.depth_rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -19,11 +19,11 @@ from vislam.vision.features import FlowSettings, detect_corners, follow
 
 _BLOCK = 40  # frames in a row
 _MOST_FRAMES = 480
-_FLOW_EVERY = 4  # frames: one of this many has its dense flow computed
+_FLOW_EVERY = 4  # frames: one of this many has its depth read and its dense flow computed
 _NEW_KEY_S = 0.25
 _LONGEST_S = 1.0  # of a pair
 _KEPT = 0.4  # of the corners of a first view: with fewer, the pair is finished
-_CORNERS = 300
+_CORNERS = 200
 _CORNER_CELL_PX, _CORNER_DISTANCE_PX, _CORNER_QUALITY = 40, 8.0, 30.0
 _LEAST_CORNERS = 30
 _FLOW = FlowSettings(levels=4)  # frames may be far apart
@@ -45,6 +45,7 @@ class Walk:
     ends: tuple[FrameEnds, ...]
     pairs: tuple[PairTracks, ...]
     frames: int
+    depth_rows: frozenset[int]  # that could be read
 
 
 @dataclass(slots=True, eq=False)
@@ -53,8 +54,8 @@ class _Key:
 
     frame: int
     count: int
-    begin: Array
-    now: Array
+    begin: Array  # [N, 2]
+    rows: NDArray[np.int64]  # [N] of its corners among all that are followed, rising
     speeds: list[Array] = field(default_factory=list)  # of the first two steps and the last two
 
 
@@ -66,27 +67,30 @@ class _Block:
     t_ns: NDArray[np.int64]
     period_s: float
     keys: list[_Key] = field(default_factory=list)
+    now: Array = field(default_factory=lambda: np.empty((0, 2)))  # corners in the frame before, each once for all keys
     before: tuple[int, ImageU8, ImageF32 | None] | None = None
     ends: list[FrameEnds] = field(default_factory=list)
     pairs: list[PairTracks] = field(default_factory=list)
 
     def see(self, frame: int, image: ImageU8, depth_m: ImageF32 | None, is_last: bool) -> None:
-        """Take the next frame."""
+        """Take the next frame; without its depth, it is not compared with it."""
+        has_depth = bool(np.isfinite(self.delay_s[frame]))
         if self.before is not None:
             self._compare(frame, image)
-            self._follow(frame, image, depth_m is not None, is_last)
-        if depth_m is not None and (not self.keys or (frame - self.keys[-1].frame) * self.period_s >= _NEW_KEY_S):
-            corners = detect_corners(
-                image, _CORNERS, _CORNER_CELL_PX, _CORNER_DISTANCE_PX, np.empty((0, 2)), _CORNER_QUALITY
-            )
-            if len(corners) >= _LEAST_CORNERS:
-                self.keys.append(_Key(frame, len(corners), corners, corners))
+            self._follow(frame, image, has_depth, is_last)
+        if has_depth and (not self.keys or (frame - self.keys[-1].frame) * self.period_s >= _NEW_KEY_S):
+            free = _CORNERS - len(self.now)
+            corners = detect_corners(image, free, _CORNER_CELL_PX, _CORNER_DISTANCE_PX, self.now, _CORNER_QUALITY)
+            begin = np.vstack([self.now, corners])
+            if len(begin) >= _LEAST_CORNERS:
+                self.now = begin
+                self.keys.append(_Key(frame, len(begin), begin, np.arange(len(begin))))
         self.before = (frame, image, depth_m)
 
     def _compare(self, frame: int, image: ImageU8) -> None:
         assert self.before is not None
         last, last_image, depth_m = self.before
-        if depth_m is None or last % _FLOW_EVERY or not np.isfinite(self.delay_s[last]):
+        if depth_m is None:
             return
         flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(
             last_image, image, np.zeros((*image.shape, 2), np.float32)
@@ -100,25 +104,25 @@ class _Block:
             return
         last, last_image, _ = self.before
         dt_s = (self.t_ns[frame] - self.t_ns[last]) * 1e-9
-        start = np.vstack([key.now for key in self.keys])
-        there, _ = follow(last_image, image, start, start, _FLOW)
-        speed, at, alive = (there - start) / dt_s, 0, []
+        there, _ = follow(last_image, image, self.now, self.now, _FLOW)
+        speed, alive = (there - self.now) / dt_s, []
+        is_seen = np.asarray(np.isfinite(there).all(axis=1))
+        row = np.cumsum(is_seen) - 1
         for key in self.keys:
-            part = slice(at, at + len(key.now))
-            at += len(key.now)
-            seen = np.isfinite(there[part]).all(axis=1)
-            steps = [*key.speeds, speed[part]]
+            seen = is_seen[key.rows]
+            steps = [*key.speeds, speed[key.rows]]
             key.speeds = [one[seen] for one in (steps[:2] + steps[-2:] if len(steps) > 4 else steps)]
-            key.begin, key.now = key.begin[seen], there[part][seen]
+            now = there[key.rows[seen]]
+            key.begin, key.rows = key.begin[seen], row[key.rows[seen]]
             long = (frame - key.frame) * self.period_s >= _LONGEST_S
-            if len(key.now) < _LEAST_CORNERS:
+            if len(now) < _LEAST_CORNERS:
                 continue
-            if has_depth and (is_last or long or len(key.now) < _KEPT * key.count):
-                ends = (key.begin, key.now), (_at_end(*key.speeds[:2]), _at_end(*key.speeds[:-3:-1]))
+            if has_depth and (is_last or long or len(now) < _KEPT * key.count):
+                ends = (key.begin, now), (_at_end(*key.speeds[:2]), _at_end(*key.speeds[:-3:-1]))
                 self.pairs.append(PairTracks((key.frame, frame), *ends))
             else:
                 alive.append(key)
-        self.keys = alive
+        self.keys, self.now = alive, there[is_seen] if alive else np.empty((0, 2))
 
 
 def _at_end(step: Array, beside: Array | None = None) -> Array:
@@ -135,18 +139,22 @@ def walk(found: Survey, rig: Rig, frames: FrameTable, progress: Progress = silen
     period_s = float(np.median(np.diff(frames.t_ns))) * 1e-9 if len(frames.t_ns) > 1 else 1.0
     ends: list[FrameEnds] = []
     pairs: list[PairTracks] = []
+    read = set[int]()
     blocks = _blocks(len(frames.t_ns))
-    with closing(open_loader(found, rig, frames, 1)) as loader:
+    compared = replace(frames, depth_rows=np.where(np.arange(len(paired)) % _FLOW_EVERY, -1, frames.depth_rows))
+    with closing(open_loader(found, rig, compared, 1)) as loader:
         for block in blocks:
             part = _Block(delays_s, frames.t_ns, period_s)
             for i in block:
                 loaded = loader.load(i)
                 if loaded.images:
                     part.see(i, loaded.images[0], loaded.depth_m, i == block[-1])
+                if loaded.depth_m is not None:
+                    read.add(int(frames.depth_rows[i]))
                 progress(i + 1, len(frames.t_ns), "colour and depth")
             ends += part.ends
             pairs += part.pairs
-    return Walk(tuple(ends), tuple(pairs), sum(map(len, blocks)))
+    return Walk(tuple(ends), tuple(pairs), sum(map(len, blocks)), frozenset(read))
 
 
 def _blocks(count: int) -> list[range]:

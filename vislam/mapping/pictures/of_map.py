@@ -14,10 +14,10 @@ from vislam.core.messages import ImageU8
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh
 from vislam.mapping.drive.drive_grid import Drive, DriveGrid
+from vislam.mapping.file_names import FILES
 from vislam.mapping.formats.ply import read_ply, read_ply_mesh
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.pictures.picture import Line, draw_ends, render_cloud, render_mesh, render_octree
-from vislam.mapping.products import FILES
 
 _NEED_UP = ("picture_octree.png", "picture_where_to_drive.png")
 _PATH_COLOR = (37, 99, 235)  # the blue that the report gives to the graph

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.files import write_json
 from vislam.core.reading import read_json
+from vislam.mapping.file_names import CLASSES_NAME, VOXELS_NAME
 from vislam.mapping.formats.ply import read_ply_rows, write_ply
 from vislam.mapping.semantic.classes import LabelClasses
 from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.votes import voxel_keys
 
-VOXELS_NAME, CLASSES_NAME = "labels.ply", "labels.json"
 _MAX_JSON_BYTES = 64 * 2**20
 
 

@@ -18,8 +18,9 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array, Tracking
 from vislam.factors import rig_from
 from vislam.loop import caption
+from vislam.mapping.file_names import CLASSES_NAME
 from vislam.mapping.formats.ply import read_ply
-from vislam.mapping.semantic.layer_files import CLASSES_NAME, read_layer
+from vislam.mapping.semantic.layer_files import read_layer
 from vislam.runs.report.page_assets import floats, packed
 from vislam.runs.report.run_files import RunFiles
 from vislam.runs.report.scene import Scene, loop_ends
