@@ -203,6 +203,18 @@ def test_a_gap_of_three_seconds_is_bridged_by_recognition(kind: str) -> None:
     assert np.linalg.norm(se3_log(invert(true) @ found.vo.T_keyframe_body)[3:]) < 0.02
 
 
+def test_a_front_end_that_begins_at_a_keyframe_has_the_habits_that_were_learned_there() -> None:
+    world, frames, _ = recording("rgbd")
+    front = make_frontend(CONFIG, world.rig, 0)
+    newest = [frame for frame in frames if front.track(frame, None).keyframe is not None][-1]
+    habits = front.learned.habits
+    after = make_frontend(CONFIG, world.rig, 0)
+    after.begin_at(9, front.learned)
+    after.track(newest, None)
+    assert np.linalg.norm(habits[:6]) > 0.01 and habits[7] > 10
+    assert np.array_equal(after.learned.habits, habits)
+
+
 def test_a_gap_into_another_place_restarts() -> None:
     world, frames, _ = recording("stereo")
     away = np.diag([-1.0, -1.0, 1.0, 1.0])  # turned by 180 degrees: the walls are behind

@@ -198,6 +198,11 @@ def test_an_interrupted_run_is_resumed_once_and_then_finished(copied, capsys):
     assert "nothing to resume" in capsys.readouterr().err
 
 
+def test_the_habits_of_the_front_end_are_kept(ended):
+    habits = recall(Session(ended / "session.db")).front.learned.habits
+    assert habits.shape == (11,) and habits[7] > 10 and np.linalg.norm(habits[:6]) > 0.1
+
+
 def test_two_resumed_runs_give_identical_bytes(ended, tmp_path):
     digests = []
     for name in ("a", "b"):

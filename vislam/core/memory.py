@@ -232,6 +232,9 @@ class Learned:
     tilt: Array | None = None  # [6] of a camera over a floor: what the mount lacks [2] and its covariance [2, 2]
     depth_delay_s: float | None = None  # of depth images, beyond their stamps; None: not estimated
     depth_rows_s: float | None = None  # by how much longer their rows take than an image's; None: not estimated
+    # [11] of a camera with depth: velocity [6] at the keyframe, rotation first, in its own frame; noise of tracks [2];
+    # information in 1/s^2 on readout, delay and rows; None: not known
+    habits: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,9 +31,9 @@ class MotionPredictor:
         self._longest_s = longest_s
         self._twist_per_s = np.zeros(6)
 
-    def forget(self) -> None:
-        """Assume a camera at rest, as after a loss."""
-        self._twist_per_s = np.zeros(6)
+    def forget(self, twist_per_s: Array | None = None) -> None:
+        """Assume a velocity [6] of the camera, rotation first, or a camera at rest, as after a loss."""
+        self._twist_per_s = np.zeros(6) if twist_per_s is None else twist_per_s
 
     def look_through(self, T_body_cam: Array, T_cam_other: Array) -> None:
         """Go on predicting for another camera of the same body, at T_cam_other [4, 4] as the present one sees it."""

@@ -8,7 +8,7 @@ Forssen, "Scan rectification for structured light range sensors with rolling shu
 once.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -41,6 +41,7 @@ _MOST_ALIKE = 1e6  # condition of what tells delay and rows apart; rows are coun
 _LEAST_TRACKS = 10  # that tell of delay and rows in one frame
 _LEAST_READOUT = 0.005  # s: a shorter one counts as none, for it is the sum of two that were learnt ...
 _KNOWN_S = 0.002  # ... and depth is moved by it only once it is known so well
+_ONE_FRAME = (1.0 / _FRAME_SIGMA_S**2,) * 2  # what an earlier run's delay and rows count for at least
 _GATE = 3.0  # standard deviations of a depth that tells of the delay
 
 
@@ -77,10 +78,15 @@ class DepthLag:
         """By how much longer rows of depth take than the image's, as far as was learnt; None: the readout was told."""
         return None if self._rows.is_told else self._rows.estimate_s
 
-    def start_at(self, delay_s: float | None, rows_s: float | None) -> None:
-        """Take what an earlier run had learned, to be learned further."""
-        self._delay.start_at(delay_s)
-        self._rows.start_at(rows_s)
+    def start_at(self, delay_s: float | None, rows_s: float | None, information: Sequence[float] = _ONE_FRAME) -> None:
+        """Take what an earlier run had learned, with its `information` [2] in 1/s^2, to be learned further."""
+        self._delay.start_at(delay_s, information[0])
+        self._rows.start_at(rows_s, information[1])
+
+    @property
+    def information(self) -> list[float]:
+        """The information [2] on delay and rows, in 1/s^2."""
+        return [self._delay.information, self._rows.information]
 
     def measure(
         self, sensor: DepthSensor, frame: Frame, pixels: Array, xy: Array, rho: Array, twist_per_s: Array,
@@ -197,23 +203,22 @@ class _Learnt:
     def __init__(self, told_s: float | None) -> None:
         self.is_told = told_s is not None
         self.estimate_s = told_s or 0.0
-        self._information = 1.0 / _SIGMA_S**2
+        self.information = 1.0 / _SIGMA_S**2
 
     @property
     def sigma_s(self) -> float:
-        return float(self._information**-0.5)
+        return float(self.information**-0.5)
 
-    def start_at(self, seconds: float | None) -> None:
+    def start_at(self, seconds: float | None, information: float) -> None:
         if seconds is not None and not self.is_told:
-            self.estimate_s = min(max(seconds, -_MAX_S), _MAX_S)
-            self._information = 1.0 / _FRAME_SIGMA_S**2
+            self.estimate_s, self.information = min(max(seconds, -_MAX_S), _MAX_S), information
 
     def take(self, seconds: float, information: float) -> None:
         if self.is_told:
             return
         trusted = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)
-        self._information = min(self._information, _MEMORY_FRAMES / _FRAME_SIGMA_S**2) + trusted
-        self.estimate_s += trusted / self._information * (seconds - self.estimate_s)
+        self.information = min(self.information, _MEMORY_FRAMES / _FRAME_SIGMA_S**2) + trusted
+        self.estimate_s += trusted / self.information * (seconds - self.estimate_s)
         self.estimate_s = min(max(self.estimate_s, -_MAX_S), _MAX_S)
 
 
@@ -235,9 +240,10 @@ class Exposures:
 
     def start_at(self, learned: Learned) -> None:
         """Take what an earlier run had learned, to be learned further."""
+        information = (1.0 / _FRAME_SIGMA_S**2,) * 3 if learned.habits is None else learned.habits[8:].tolist()
         if learned.readout_s is not None:
-            self.shutter.start_at(learned.readout_s)
-        self.lag.start_at(learned.depth_delay_s, learned.depth_rows_s)
+            self.shutter.start_at(learned.readout_s, information[0])
+        self.lag.start_at(learned.depth_delay_s, learned.depth_rows_s, information[1:])
 
     def learned(self, next_track_id: int, knows_lag: bool) -> Learned:
         """Return what was learned, as `start_at` takes it; `knows_lag` is whether every frame measures depth."""

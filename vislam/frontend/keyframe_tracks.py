@@ -109,11 +109,11 @@ class KeyframeTracks:
         self.tracker.forget()
         self.landmarks = Landmarks()
 
-    def begin(self, frame: Frame) -> Observations:
-        """Begin at a frame, with new tracks only; return what it sees of them."""
+    def begin(self, frame: Frame, twist_per_s: Array) -> Observations:
+        """Begin at a frame, at a velocity [6] of the camera, with new tracks only; return what it sees of them."""
         self.forget()
         count = self.tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
-        reading = self._add_landmarks(frame, count, np.zeros(6))
+        reading = self._add_landmarks(frame, count, twist_per_s)
         return self._all(self.tracker.pixels, reading, self.landmarks.mean[:, :2])
 
     def carry_on(self, frame: Frame, attempt: Attempt) -> Observations:

@@ -100,6 +100,7 @@ class MetricFrontEnd:
         self._second = SecondCamera(config, views, self._tracks, self._placer)
         self._noise = PixelNoise(config.track_sigma_px)
         self._lost = False
+        self._twist_per_s = np.zeros(6)  # at the frame that it begins with, see `Learned.habits`
         self._blind: BlindKeyframe | None = None  # the keyframe is the first and has no depth
         has_surfaces = rig.has_depth and usual.depth.every_frame
         self._surfaces = LocalSurfaces(config, usual.camera, usual.T_body_cam) if has_surfaces else None
@@ -266,16 +267,17 @@ class MetricFrontEnd:
         """Begin again with this frame as keyframe, if there is enough to see in it."""
         tracks = self._tracks
         tracks.look_through(self._usual)
-        observations = tracks.begin(whole)
+        twist_per_s, self._twist_per_s = self._twist_per_s, np.zeros(6)
+        observations = tracks.begin(whole, twist_per_s)
         has_depth, count = self._usual.depth.available(whole), len(tracks)
         lack = self._lack(whole, has_depth)
         if lack:
             tracks.forget()
             return self._life.refused(whole.t_ns, why, lack)
-        tracks.predictor.forget()
+        tracks.predictor.forget(twist_per_s)
         self._lost = tracks.lacks_depth = False
         self._blind = None if has_depth else BlindKeyframe(self._config, self._usual, tracks.tracker.pixels)
-        self._install(whole, np.zeros(6), None)
+        self._install(whole, twist_per_s, None)
         return self._life.started(observations, count, why)
 
     def _lack(self, frame: Frame, has_depth: bool) -> str:
@@ -309,11 +311,18 @@ class MetricFrontEnd:
         self._life.begin_at(keyframe_id, seeks_place)
         self._tracks.tracker.next_id = learned.next_track_id
         self._tracks.exposures.start_at(learned)
+        if learned.habits is not None:
+            self._twist_per_s = learned.habits[:6]
+            self._noise.start_at(learned.habits[6:8])
 
     @property
     def learned(self) -> Learned:
         """See FrontEnd.learned."""
-        return self._tracks.exposures.learned(self._tracks.tracker.next_id, self._usual.depth.every_frame)
+        learned = self._tracks.exposures.learned(self._tracks.tracker.next_id, self._usual.depth.every_frame)
+        exposures = self._tracks.exposures
+        twist_per_s = np.zeros(6) if self._tracks.view.is_swapped else exposures.key_twist_per_s
+        known = [*self._noise.memory, exposures.shutter.information, *exposures.lag.information]
+        return replace(learned, habits=np.array([*twist_per_s, *known]))
 
     @classmethod
     def errors(cls, config: FrontEndConfig, rig: Rig, noise: ImuNoise | None) -> CommonErrors:

@@ -52,6 +52,15 @@ class PixelNoise:
         self._frame_px: float | None = None
 
     @property
+    def memory(self) -> list[float]:
+        """What was learned [2], as `start_at` takes it."""
+        return [self._log_px, self._frames]
+
+    def start_at(self, memory: Array) -> None:
+        """Take what an earlier run had learned, to be learned further."""
+        self._log_px, self._frames = float(memory[0]), int(memory[1])
+
+    @property
     def is_learnt(self) -> bool:
         """Whether enough frames were measured."""
         return self._frames >= _MIN_FRAMES

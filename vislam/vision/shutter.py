@@ -31,7 +31,7 @@ class Shutter:
         self._camera = camera
         self._known = readout_s is not None
         self._estimate_s = readout_s if readout_s is not None else 0.0
-        self._information = 1.0 / _SIGMA_S**2
+        self.information = 1.0 / _SIGMA_S**2
 
     @property
     def readout_s(self) -> float:
@@ -62,18 +62,17 @@ class Shutter:
         """Go on with another camera of the same make."""
         self._camera = camera
 
-    def start_at(self, readout_s: float) -> None:
-        """Take the readout that an earlier run had learned, to be learned further."""
+    def start_at(self, readout_s: float, information: float = 1.0 / _FRAME_SIGMA_S**2) -> None:
+        """Take the readout that an earlier run had learned, with `information` in 1/s^2, to be learned further."""
         if not self._known:
-            self._estimate_s = min(max(readout_s, 0.0), _MAX_S)
-            self._information = 1.0 / _FRAME_SIGMA_S**2
+            self._estimate_s, self.information = min(max(readout_s, 0.0), _MAX_S), information
 
     def learn(self, change_s: float, information: float) -> None:
         """Take in one frame's estimate: the applied readout plus `change_s`, with `information` in 1/s^2."""
         weight = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)
         measured = self.readout_s + change_s
-        self._information += weight
-        self._estimate_s += weight / self._information * (measured - self._estimate_s)
+        self.information += weight
+        self._estimate_s += weight / self.information * (measured - self._estimate_s)
         self._estimate_s = min(max(self._estimate_s, -_GLOBAL_S), _MAX_S)
 
     def to_instant(self, pixels: Array, xy: Array, rho: Array, twist_per_s: Array) -> Array:

@@ -130,7 +130,7 @@ def _start(info: dict[str, Any]) -> StartFacts | None:
 
 
 def _front(data: dict[str, Any]) -> Learned:
-    camera, tilt = data["filter_camera"], data.get("tilt")
+    camera, tilt, habits = data["filter_camera"], data.get("tilt"), data.get("habits")
     delay, rows = data.get("depth_delay_s"), data.get("depth_rows_s")
     return Learned(
         int(data["next_track_id"]),
@@ -140,6 +140,7 @@ def _front(data: dict[str, Any]) -> Learned:
         None if tilt is None else np.array(tilt, dtype=np.float64).reshape(6),
         None if delay is None else float(delay),
         None if rows is None else float(rows),
+        None if habits is None else np.array(habits, dtype=np.float64).reshape(11),
     )
 
 

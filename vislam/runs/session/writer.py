@@ -318,7 +318,7 @@ def _start_data(start: StartFacts) -> dict[str, Any]:
 
 def _front_data(front: Learned | None) -> dict[str, Any]:
     front = front or Learned()
-    arrays = {"filter_camera": front.filter_camera, "tilt": front.tilt}
+    arrays = {"filter_camera": front.filter_camera, "tilt": front.tilt, "habits": front.habits}
     return {**asdict(front), **{name: None if array is None else array.tolist() for name, array in arrays.items()}}
 
 
