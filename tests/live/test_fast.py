@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from multiprocessing import Pipe
@@ -10,16 +11,20 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 
-from vislam.config import Config
+from vislam.config import Config, load
+from vislam.core.clock import StageClock
 from vislam.core.geometry import invert, se3_exp, so3_log, transform
-from vislam.core.messages import ImuSample
+from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.ekf import Correction, Ekf, Hint
 from vislam.frontend.result import lost_motion
 from vislam.hw.health import Health
+from vislam.live.corrections import Corrections
 from vislam.live.fast import FastPath
 from vislam.live.notices import CameraHealth, Doubted, MapMoved, ToFast
 from vislam.live.processes.fast import Messages
 from vislam.live.wire.published_pose import PublishedPose
+from vislam.pipeline import Front, odometry
+from vislam.runs.sources import open_source
 from worlds.corrections import CART_IMU, CONFIG, VisionWorld
 from worlds.motion import T0_NS
 from worlds.parts import GRAVITY_M_S2, MACHINE
@@ -214,6 +219,28 @@ def test_no_samples_is_told_at_once_and_over_when_they_are_back(world: VisionWor
     assert poses[-1].t_ns == world.samples[-1].t_ns
     assert Health.IMU_MISSING not in poses[-2].health
     assert Health.INVALID not in poses[-2].health
+
+
+def test_a_step_of_the_clock_that_tears_a_tight_filter_reaches_the_published_one() -> None:
+    recording = open_source("points:laps,rig=stereo,duration_s=6,camera_hz=10,tracks=80")
+    config, poses = load(None, {"ekf.coupling": "tight"}), list[PublishedPose]()
+    front = Front(config, recording.rig, recording.imu_noise, StageClock())
+    corrections = Corrections(front)
+    fast = FastPath(config, recording.imu_noise, np.eye(4), poses.append)
+
+    def values() -> Iterator[ImuSample | MagSample | Frame]:
+        for value in recording.events():
+            if isinstance(value, ImuSample):
+                fast.add(value)
+            yield replace(value, follows_step=value.index == 40) if isinstance(value, Frame) else value
+
+    sigmas_m: dict[int, float] = {}
+    for step in odometry(front, values()):
+        for message in corrections.of_step(step):
+            fast.correct(message)
+        fast.publish(step.frame.t_ns, _WELL)
+        sigmas_m[step.frame.index] = float(np.sqrt(poses[-1].pose_covariance[0, 0]))
+    assert sigmas_m[39] < 0.5 and sigmas_m[40] > 4.0
 
 
 def test_before_the_start_poses_say_that_they_are_none() -> None:
