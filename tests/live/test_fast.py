@@ -11,10 +11,10 @@ from multiprocessing import Pipe
 import numpy as np
 import pytest
 
+from vislam import open_source
 from vislam.config import Config, load
-from vislam.core.clock import StageClock
+from vislam.core import Frame, ImuSample, MagSample, StageClock
 from vislam.core.geometry import invert, se3_exp, so3_log, transform
-from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.ekf import Correction, Ekf, Hint
 from vislam.frontend.result import lost_motion
 from vislam.hw.health import Health
@@ -24,7 +24,6 @@ from vislam.live.notices import CameraHealth, Doubted, MapMoved, ToFast
 from vislam.live.processes.fast import Messages
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.pipeline import Front, odometry
-from vislam.runs.sources import open_source
 from worlds.corrections import CART_IMU, CONFIG, VisionWorld
 from worlds.motion import T0_NS
 from worlds.parts import GRAVITY_M_S2, MACHINE
