@@ -156,7 +156,7 @@ def test_openvins_writes_the_pose_that_kalibr_inverts() -> None:
 )
 def test_a_pose_clock_or_scale_that_is_not_known_is_refused_by_name(make: Callable[[str], str], key: str) -> None:
     path = written(make(key))
-    with pytest.raises(DataError, match=rf"{path}: the meaning of {key} is not known.*write T_"):
+    with pytest.raises(DataError, match=rf"{path}: not read: {key}.*write T_"):
         read_cameras(path)
 
 
@@ -264,9 +264,13 @@ def test_kalibrs_results_of_imus_are_read_and_what_is_not_used_is_named(caplog: 
     )
     assert read_noise(written(f"imu0:\n  {block}{still}")) == NOISE
     assert not caplog.records
-    path = written(f"imu0:\n  {block}  Tw: [[1, 0, 0], [0, 1.1, 0], [0, 0, 1]]\n  time_offset: 0.01\n")
-    assert read_noise(path) == NOISE
-    assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: Tw, time_offset"]
+    assert read_noise(path := written(f"imu0:\n  {block}  gamma: 2.0\n")) == NOISE
+    assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: gamma"]
+    shifted = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    for key in (f"T_i_b: {shifted}", "Tw: [[1, 0, 0], [0, 1.1, 0], [0, 0, 1]]", "time_offset: 0.01",
+                "accelerometers: {M: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"):  # fmt: skip
+        with pytest.raises(DataError, match=f"not read: {key.split(':')[0]}; .*--calibration.imu"):
+            read_noise(written(f"imu0:\n  {block}  {key}\n"))
     with pytest.raises(DataError, match="holds 2 IMUs: imu0, imu1; give"):
         read_noise(written(f"imu0:\n  {block}imu1:\n  {block}"))
     two = written(f"imu0:\n  {block}imu1:\n  {block}".replace("/imu0", "/left/imu", 1))

@@ -7,7 +7,7 @@ states that its samples are raw; docs/formats.md lists them.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.calibration import NOISE_KEYS, Keys, load_yaml, numbers_in, parse_noise
+from vislam.datasets.calibration import NOISE_KEYS, SCALE_KEYS, Keys, load_yaml, numbers_in, parse_noise, says_nothing
 from vislam.datasets.calibration_text import list_text
 from vislam.datasets.foreign_cameras import load_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -28,7 +28,11 @@ _ORB_NOISE = dict(
     zip(("IMU.NoiseGyro", "IMU.NoiseAcc", "IMU.GyroWalk", "IMU.AccWalk"), NOISE_KEYS, strict=True),
     **{"IMU.Frequency": "update_rate"},
 )
-_OKVIS_NOISE = dict(zip(("sigma_g_c", "sigma_a_c", "sigma_gw_c", "sigma_aw_c"), NOISE_KEYS, strict=True))
+_OKVIS_NOISE = dict(
+    zip(("sigma_g_c", "sigma_a_c", "sigma_gw_c", "sigma_aw_c"), NOISE_KEYS, strict=True), imu_rate="update_rate"
+)
+_BIASES = {"calib_accel_bias": 3, "calib_gyro_bias": 3, "a0": 3, "g0": 3, "s_a": 0}  # numbers; behind: scale and axes
+_INSTEAD = "poses of cameras in this IMU and its scale in a file for --calibration.imu"
 _BASALT_NOISE = dict(
     zip(("gyro_noise_std", "accel_noise_std", "gyro_bias_std", "accel_bias_std"), NOISE_KEYS, strict=True),
     imu_update_rate="update_rate",
@@ -51,9 +55,8 @@ def imu_noise_text(noise: ImuNoise, comment: str) -> str:
 def read_noise(path: Path, topic: str = "") -> ImuNoise:
     """Return the noise model in a file of Kalibr (also its results), OpenVINS, ORB-SLAM, Basalt, or an ASL sensor.yaml.
 
-    Of several IMUs it is the one whose `rostopic` is `topic`. What the file states of the IMU beside its noise (T_i_b,
-    time_offset, Tw) is warned of where it means anything.
-    Raises DataError naming the key.
+    Of several IMUs it is the one whose `rostopic` is `topic`. Raises DataError naming the key; also for a place, clock
+    or scale of the IMU (T_i_b, time_offset, Tw) that means anything. Other keys that are not used are warned of.
     """
     data = _foreign_noise(load_keys(path), path)
     nested = [str(key) for key, value in data.items() if isinstance(value, dict) and set(NOISE_KEYS) & set(value)]
@@ -65,7 +68,7 @@ def read_noise(path: Path, topic: str = "") -> ImuNoise:
         data.name_unused(path, known=nested)
         data = Keys(data[chosen[0]])
     noise = parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
-    data.name_unused(path, known=("model",))
+    data.name_unused(path, _INSTEAD, known=("model", *(key for key, value in data.items() if says_nothing(value))))
     return noise
 
 
@@ -84,7 +87,10 @@ def _foreign_noise(data: Keys, path: Path) -> Keys:
     for names, holder in ((_BASALT_NOISE, inner), (_ORB_NOISE, data), (_OKVIS_NOISE, listed)):
         if isinstance(holder, dict) and any(name in holder for name in names):
             stated = {key: numbers_in(holder, name, path) for name, key in names.items() if name in holder}
-            return Keys({key: max(values, default=None) for key, values in stated.items()})
+            rest = {name: numbers_in(holder, name, path) for name in _BIASES if name in holder}
+            scales = {f"scale in {name}": values[_BIASES[name] :] for name, values in rest.items()}
+            biases = {name: values[: _BIASES[name]] for name, values in rest.items()}
+            return Keys({key: max(values, default=None) for key, values in stated.items()} | biases | scales)
     return data
 
 
@@ -120,12 +126,12 @@ def mag_calibration_keys(calibration: MagCalibration) -> str:
 
 def read_imu_calibration(path: Path) -> ImuCalibration:
     """Return the calibration of an IMU in a file; raises DataError when it holds none."""
-    return _wanted(imu_calibration(load_yaml(path), path), path, _IMU_KEYS, "imu")
+    return _wanted(imu_calibration, path, _IMU_KEYS, "imu")
 
 
 def read_mag_calibration(path: Path) -> MagCalibration:
     """Return the calibration of a magnetometer in a file; raises DataError when it holds none."""
-    return _wanted(mag_calibration(load_yaml(path), path), path, _MAG_KEYS, "mag")
+    return _wanted(mag_calibration, path, _MAG_KEYS, "mag")
 
 
 def imu_calibration(data: Mapping[str, Any], path: Path) -> ImuCalibration | None:
@@ -150,9 +156,13 @@ def _values(data: Mapping[str, Any], path: Path, keys: Mapping[str, int]) -> dic
     return {key: value.reshape(3, 3) if len(value) == 9 else value for key, value in arrays.items()}
 
 
-def _wanted(found: Calibration | None, path: Path, keys: Mapping[str, int], kind: str) -> Calibration:
+def _wanted(
+    of: Callable[[Keys, Path], Calibration | None], path: Path, keys: Mapping[str, int], kind: str
+) -> Calibration:
+    found = of(data := Keys(load_yaml(path)), path)
     if found is None:
         raise DataError(f"{path} holds none of {', '.join(keys)}; `vislam calibrate {kind}` writes such a file")
+    data.name_unused(path, known=(*NOISE_KEYS, *SCALE_KEYS, "rate_hz"))
     return found
 
 

@@ -181,8 +181,9 @@ def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path |
     T_body_mag, calibration = T_body_imu, None
     try:
         if sensor.is_file():
-            keys = files.load_yaml(sensor)
+            keys = files.Keys(files.load_yaml(sensor))
             T_body_mag, calibration = files.read_pose(keys, sensor), mag_calibration(keys, sensor)
+            keys.name_unused(sensor, "T_BS")
     except DataError as error:
         errors.append(error)
         return None, np.eye(3), None
@@ -195,7 +196,9 @@ def _truth(root: Path, T_body_imu: Array, errors: list[DataError]) -> Truth | No
         data, sensor = root / name / "data.csv", root / name / "sensor.yaml"
         if data.is_file():
             try:
-                T_body_sensor = files.read_pose(files.load_yaml(sensor), sensor) if sensor.is_file() else T_body_imu
+                keys = files.Keys(files.load_yaml(sensor) if sensor.is_file() else {})
+                T_body_sensor = files.read_pose(keys, sensor) if keys else T_body_imu
+                keys.name_unused(sensor, "T_BS")
             except DataError as error:
                 errors.append(error)
                 return None
