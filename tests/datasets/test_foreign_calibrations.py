@@ -174,11 +174,21 @@ def test_files_of_other_programs_are_read(
     assert not caplog.records
 
 
-@pytest.mark.parametrize("text", [OKVIS, MAPLAB], ids=["OKVIS", "maplab"])
-def test_cameras_of_okvis_and_maplab_are_read_with_their_places(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "offset_s"),
+    [
+        (OKVIS, None),
+        (OKVIS + "camera_parameters: {image_delay: 0.1}\n", -0.1),
+        (OKVIS + "imageDelay: 0.1\n", -0.1),
+        (MAPLAB, None),
+    ],
+)
+def test_cameras_of_okvis_and_maplab_are_read_with_their_places(
+    text: str, offset_s: float | None, tmp_path: Path
+) -> None:
     (tmp_path / "theirs.yaml").write_text(text)
     found = read_cameras(tmp_path / "theirs.yaml")
-    assert [one.camera for one in found] == [FISHEYE, RADTAN]
+    assert [one.camera for one in found] == [FISHEYE, RADTAN] and found[0].time_offset_s == offset_s
     assert found[0].T_body_cam == pytest.approx(T0) and found[1].T_body_cam == pytest.approx(T0 @ T01)
 
 
@@ -207,9 +217,10 @@ def test_a_pair_of_opencv_has_its_place_there_or_in_the_file_beside(tmp_path: Pa
 
 
 def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
-    for k in range(2):
-        (tmp_path / f"cam{k}_pinhole.yaml").write_text(vins_lens())
-    text = '%YAML:1.0\nimu: 1\nnum_of_cam: 2\ncam0_calib: "cam0_pinhole.yaml"\ncam1_calib: "/x/cam1_pinhole.yaml"\n'
+    (tmp_path / "848").mkdir()
+    for name in ("848/cam0_pinhole.yaml", "cam1_pinhole.yaml"):
+        (tmp_path / name).write_text(vins_lens())
+    text = '%YAML:1.0\nimu: 1\nnum_of_cam: 2\ncam0_calib: "848/cam0_pinhole.yaml"\ncam1_calib: "/x/cam1_pinhole.yaml"\n'
     poses = matrix("body_T_cam0", T0) + matrix("body_T_cam1", T0 @ T01)
     (tmp_path / "main.yaml").write_text(f"{text}{poses}td: -0.01\n")
     found = read_cameras(tmp_path / "main.yaml")
@@ -243,7 +254,7 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (opencv(D5, size=""), "without image size; add image_width"),
         (MAPLAB.replace("    label: c", "    time_offset: 0.1"), "not read: time_offset"),
         (MAPLAB.replace("label: rig", "T_G_B: 1"), "not read: T_G_B"),
-        (OKVIS + "camera_parameters: {image_delay: 0.1}\n", "sign of OKVIS's image_delay is not known"),
+        ('{"camera_model": "OPENCV", "fl_x": 10.0, "k1": 0.0, "k2": 0.0}', "holds camera_model, fl_x"),
         ("# oST version 5.0 parameters\n", "is ROS's ost.txt; give its ost.yaml"),
         (XML.replace("<opencv_storage>", "<!DOCTYPE x><opencv_storage>"), "no document type"),
         (XML[:-20], "cannot be read as JSON or XML"),

@@ -222,6 +222,7 @@ def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
         (b"t,x,y,z,qx,qy,qz\n1,0,0,0,0,0,0\n", "qx, qy, qz: which rotation"),
         (b"# t x y theta\n1 0 0 0\n", "one column of each x, y, z is wanted; it names x, y"),
         (b"t,pose0.position.x,pose0.position.y,pose0.position.z,pose1.position.x\n1,0,0,0,0\n", "names pose0.*pose1"),
+        (b"simTime,x,y,z,roll,pitch,yaw\n1,0,0,0,0,0,0\n", "roll, pitch, yaw: which rotation"),
         (b"t,x_ft,y_ft,z_ft\n1,0,0,0\n", "x_ft, y_ft, z_ft are not all metres"),
         (b"1403636579763555,1,2,3,0.1,0.2,0.3\n", "7 numbers whose last four are no quaternion"),
         (b"1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", "poses:2: NaN"),
@@ -260,6 +261,8 @@ def test_quoted_fields_and_comments_in_any_encoding_are_read(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("names", ["timestamp(s) q p v bg ba cam_imu_dt num_cam etc",
+                                   "timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot cam0_trans ... "
+                                   "imu_model dw da tg wtoI atoI etc",
                                    "timestamp(s) qx qy qz qw px py pz vx vy vz etc"])  # fmt: skip
 def test_states_of_openvins_are_read_by_their_names(names: str, tmp_path: Path) -> None:
     path = tmp_path / "state_estimate.txt"

@@ -64,7 +64,7 @@ _OF_DEPTH = ("T_BS", "camera_model", "distortion_model", "distortion_coefficient
 _DEPTH_UNITS = ("depth_units_per_m", "RGBD.DepthMapFactor", "DepthMapFactor")  # ours and ORB-SLAM's
 # a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale (Tw)
 WEIGHTY = re.compile(
-    r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{1,2}$|extrinsic|^gyroscopes$|^accelerometers$|(time|stamp|clock|cam|camera|image|imu)_?(shift|offset|delay|lag)|^td$|scale",
+    r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{1,2}$|extrinsic|^gyroscopes$|^accelerometers$|(?i:(time|stamp|clock|cam|camera|image|imu)_?(shift|offset|delay|lag))|^td$|scale",
     re.A,
 )
 _MOST_NAMED = 12

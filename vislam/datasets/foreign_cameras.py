@@ -184,7 +184,9 @@ def _vins(data: Keys, path: Path) -> list[CameraCalibration]:
     else:
         for k in range(2):
             if data.get(f"cam{k}_calib") is not None:
-                beside = path.with_name(Path(str(data[f"cam{k}_calib"])).name)
+                named = Path(str(data[f"cam{k}_calib"]))  # relative to this file, but to no other folder than its own
+                is_inside = not named.is_absolute() and ".." not in named.parts
+                beside = path.parent / named if is_inside else path.with_name(named.name)
                 T = pose_in(data, f"body_T_cam{k}", path)
                 found.append(CameraCalibration(_vins_lens(load_keys(beside), beside), T, time_offset_s=offset_s))
     if str(data.get("estimate_extrinsic", 0)) == "2":  # by which the poses are placeholders
@@ -290,6 +292,8 @@ def _basalt(data: Keys, path: Path) -> list[CameraCalibration]:
 
 def _okvis(data: Keys, path: Path) -> list[CameraCalibration]:
     found = []
+    delays = (dict(data.get("camera_parameters") or {}).get("image_delay"), data.get("imageDelay"))
+    offset_s = next((-float(delay) for delay in delays if delay is not None), None)  # OKVIS subtracts it from stamps
     for entry in data["cameras"][:2]:
         keys = Keys(entry)
         width, height = numbers_in(keys, "image_dimension", path, 2)
@@ -298,12 +302,8 @@ def _okvis(data: Keys, path: Path) -> list[CameraCalibration]:
         if not name:
             raise DataError(f"{path}: OKVIS's distortion {keys['distortion_type']} is not supported; use {[*_LISTED]}")
         camera = ros_camera((int(width), int(height)), K, name, k, str(path))
-        found.append(CameraCalibration(camera, pose_in(keys, "T_SC", path)))
+        found.append(CameraCalibration(camera, pose_in(keys, "T_SC", path), offset_s))
         keys.name_unused(path, "T_SC", _OKVIS_SILENT)
-    if float(dict(data.get("camera_params", data.get("camera_parameters")) or {}).get("image_delay", 0.0)):
-        raise DataError(
-            f"{path}: the sign of OKVIS's image_delay is not known; set it to 0, time offsets are estimated"
-        )
     _refuse_weighty(data, path, "T_SC in each camera's block")
     return found
 
@@ -361,8 +361,8 @@ _PROGRAMS: tuple[tuple[str, Callable[[Keys], bool], Callable[[Keys, Path], list[
     ("ORB-SLAM", lambda data: "Camera.fx" in data or "Camera1.fx" in data, _orb_slam),
     ("OKVIS", lambda data: "T_SC" in _first_of(data), _okvis),
     ("maplab", lambda data: "T_B_C" in _first_of(data), _maplab),
-    ("OpenCV", lambda data: any(f"{name}1" in (str(key).lower().replace("_", "") for key in data)
-                                for name in _PAIR[0]), _opencv_pair),
+    ("OpenCV", lambda data: any({f"{name}1", f"{name}2"} <= {str(key).lower().replace("_", "") for key in data}
+                                for name in _PAIR[0] + _PAIR[1][:1]) and "fl_x" not in data, _opencv_pair),
     ("ROS or OpenCV", lambda data: any(
         _OPENCV.get(str(key).lower().replace("_", "")) == "camera_matrix" for key in data), _ros_or_opencv),
 )  # fmt: skip

@@ -133,7 +133,7 @@ def _role(name: str) -> str:
     if not words:
         return ""
     *before, last = words
-    if "stamp" in words or (words[0] in _TIMES and last not in "xyz"):
+    if "stamp" in words or (words[0] in _TIMES and last not in "xyz") or words[0].endswith(("time", "timestamp")):
         return "t"
     if _RATES & set(words):
         return ""

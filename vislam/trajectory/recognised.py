@@ -163,8 +163,8 @@ def _layout(path: Path) -> _Layout:
     rows = [_fields(line, separator) for _, line in sample]
     headers = [_fields(text, separator) for text in reversed(comments)]
     width = len(rows[0])
-    names = next((n for n in headers if len(n) == width), [])
-    names = names or next((whole for n in headers if (whole := whole_names(n, width))), [])
+    names = next((whole for n in headers if (whole := whole_names(n, width))), [])
+    names = names or next((n for n in headers if len(n) == width), [])
     has_header = not any(_is_number(field) for field in rows[0])
     if has_header:
         names, rows = rows[0], rows[1:]
