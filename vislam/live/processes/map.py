@@ -163,6 +163,10 @@ class _LiveRun(Run):
         self._followed.life.when_over()
 
     @property
+    def _is_hurried(self) -> bool:
+        return self._followed.life.is_brief
+
+    @property
     def _frames_due(self) -> int:
         """All frames; where the run has to end soon, those whose keyframes the graph had got by then."""
         back = self._followed.back
