@@ -10,11 +10,9 @@ import pytest
 from test_other_formats import write_kitti, write_tum, write_video
 
 from vislam.config import CalibrationConfig
-from vislam.core import NO_IMAGE, Frame
-from vislam.core.camera import Camera, Rig
-from vislam.core.errors import DataError, UsageError
-from vislam.core.geometry import invert, se3_exp, so3_exp, so3_log
-from vislam.core.recording import MaskedRecording
+from vislam.core import (
+    NO_IMAGE, Camera, DataError, Frame, MaskedRecording, Rig, UsageError, invert, se3_exp, so3_exp, so3_log,
+)  # fmt: skip
 from vislam.datasets import open_dataset
 from vislam.datasets.calibration_text import camera_text
 from vislam.datasets.camera_turns import fit_turns, follow_turns, judged_turns

@@ -323,8 +323,8 @@ class Run:
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             counters |= back.counters
-        asked = None if self._is_hurried else self.recording
-        evidence, verdict = judged(self._evidence(front, final), self.config.verdict, asked, self.witness.seen)
+        gathered = self._evidence(front, final)
+        evidence, verdict = judged(gathered, self.config.verdict, self.recording, self.witness.seen)
         self.warnings += front.noise_warnings
         found = self._found_in_map()
         by_truth, not_compared = accuracy(self.log, final, truth, front.alignment, self._input.problems)
@@ -374,11 +374,6 @@ class Run:
         keyframes = self.witness.evidence(ids, graph.poses(), states)
         reports = graph.edge_reports()
         return whole_evidence(front, self.log, final, self._frames_due, reports, by_keyframe, apart, keyframes)
-
-    @property
-    def _is_hurried(self) -> bool:
-        """Whether the run has to end soon: what takes seconds is not asked then."""
-        return False
 
     @property
     def _frames_due(self) -> int:

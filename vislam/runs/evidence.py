@@ -173,7 +173,11 @@ def _calibration(learned: dict[str, float]) -> dict[str, Any]:
 
 
 class KeyframeWitness:
-    """Owns what keyframes bring that only a comparison of sensors asks for: turns by vision, inertial steps."""
+    """Owns what keyframes bring that only a comparison of sensors asks for: turns by vision, inertial steps, images.
+
+    Attributes:
+        is_hurried: whether the run has to end soon: what takes seconds is not asked then.
+    """
 
     def __init__(self, config: Config) -> None:
         """Start empty."""
@@ -184,11 +188,12 @@ class KeyframeWitness:
         self._scale_sigma = 0.0
         self._seen: list[tuple[ImageU8, ...]] = []
         self._every, self._keyframes = 1, 0
+        self.is_hurried = False
 
     @property
-    def seen(self) -> Sequence[tuple[ImageU8, ...]]:
-        """Images of some keyframes that several cameras saw, spread over the run."""
-        return self._seen
+    def seen(self) -> Sequence[tuple[ImageU8, ...]] | None:
+        """Images of some keyframes that several cameras saw, spread over the run; None: nothing is to be asked."""
+        return None if self.is_hurried else self._seen
 
     def _look(self, images: tuple[ImageU8, ...]) -> None:
         if len(images) > 1 and self._keyframes % self._every == 0:
@@ -308,15 +313,15 @@ def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart
 
 
 def judged(
-    evidence: Evidence, config: VerdictConfig, recording: Recording | None, seen: Sequence[tuple[ImageU8, ...]]
+    evidence: Evidence, config: VerdictConfig, recording: Recording, seen: Sequence[tuple[ImageU8, ...]] | None
 ) -> tuple[Evidence, Verdict]:
     """Return evidence and verdict; of a run that is not trusted with what contradicts its extrinsics.
 
-    They are the usual cause of a run that fails from its first frame on. Without a recording nothing is asked; `seen`
-    is as for `contradicted_extrinsics`.
+    They are the usual cause of a run that fails from its first frame on. `seen` is as for `contradicted_extrinsics`;
+    with None nothing is asked.
     """
     verdict = judge(evidence, config)
-    if verdict.state is not Trust.TRUSTED and recording is not None:
+    if verdict.state is not Trust.TRUSTED and seen is not None:
         evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen) + evidence.causes)
         verdict = judge(evidence, config)
     return evidence, verdict

@@ -142,6 +142,7 @@ class _LiveRun(Run):
 
     def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
         """Write all files; without map and pictures where the run has to end soon."""
+        self.witness.is_hurried = self._followed.life.is_brief
         return super()._finish(start, is_brief or self._followed.life.is_brief)
 
     def _settle(self, update: GraphUpdate, record: GraphRecord) -> None:
@@ -161,10 +162,6 @@ class _LiveRun(Run):
             if self.joined_t_ns is not None and not was_found:
                 self._followed.life.note(found_in_map=True)
         self._followed.life.when_over()
-
-    @property
-    def _is_hurried(self) -> bool:
-        return self._followed.life.is_brief
 
     @property
     def _frames_due(self) -> int:
