@@ -11,7 +11,17 @@ from test_other_formats import write_kitti, write_tum, write_video
 
 from vislam.config import CalibrationConfig
 from vislam.core import (
-    NO_IMAGE, Camera, DataError, Frame, MaskedRecording, Rig, UsageError, invert, se3_exp, so3_exp, so3_log,
+    NO_IMAGE,
+    Camera,
+    DataError,
+    Frame,
+    MaskedRecording,
+    Rig,
+    UsageError,
+    invert,
+    se3_exp,
+    so3_exp,
+    so3_log,
 )  # fmt: skip
 from vislam.datasets import open_dataset
 from vislam.datasets.calibration_text import camera_text
