@@ -2,15 +2,19 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from vislam.config import Config
+from vislam.core import DataError
 from vislam.core.memory import EdgeReport
 from vislam.core.messages import LoopDecision
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.evidence import KeyframeWitness, contradicting, front_evidence, judged
+from vislam.runs.metrics import refuse
 from vislam.runs.verdict import Trust
 
 
@@ -39,3 +43,13 @@ def test_images_of_few_keyframes_are_kept_from_all_over_a_run_and_asked_only_whe
     lost = front_evidence(FrontReport("stereo", None, None, "", {}, {}, [], {}, 0.0, {}), Config().machine)
     evidence, verdict = judged(replace(lost, soft_resets=2), Config().verdict, None, witness.seen)
     assert evidence.causes == () and verdict.state is not Trust.TRUSTED
+
+
+def test_a_run_without_a_frame_names_what_most_images_are():
+    met = {"frames": 0, "name": "x", "problems": {"missing image": 1, "image that is a Git LFS pointer": 9}}
+    with pytest.raises(
+        DataError, match="x: not one usable frame: image that is a Git LFS pointer; run `vislam doctor`"
+    ):
+        refuse(met, Path())
+    with pytest.raises(DataError, match="x: not one usable frame; run"):
+        refuse(met | {"problems": {}}, Path())
