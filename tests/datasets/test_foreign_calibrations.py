@@ -256,6 +256,7 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (MAPLAB.replace("label: rig", "T_G_B: 1"), "not read: T_G_B"),
         ('{"camera_model": "OPENCV", "fl_x": 10.0, "k1": 0.0, "k2": 0.0}', "holds camera_model, fl_x"),
         ("# oST version 5.0 parameters\n", "is ROS's ost.txt; give its ost.yaml"),
+        ("sensors:\n  - {sensor_type: NCAMERA}\n", "is maplab's file of all sensors; give the block of its NCAMERA"),
         (XML.replace("<opencv_storage>", "<!DOCTYPE x><opencv_storage>"), "no document type"),
         (XML[:-20], "cannot be read as JSON or XML"),
         ("<svg></svg>", "holds <svg>"),

@@ -53,6 +53,7 @@ _RESULTS = {  # what is no mapping, by how it begins
     "Calibration results": "Kalibr's report; give its camchain.yaml",
     "# oST version": "ROS's ost.txt; give its ost.yaml",
     "# Camera list": "COLMAP's cameras.txt; write a sensor.yaml, see docs/formats.md",
+    "sensors:": "maplab's file of all sensors; give the block of its NCAMERA, cameras: ..., as a file of its own",
     "[LEFT_CAM": "the settings of a ZED; write a sensor.yaml, see docs/formats.md",
 }
 _LISTED = {  # how OKVIS and maplab name distortions, as ROS does

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from vislam.core.errors import DataError
 
-_UNIT_NAMES = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6}
-_UNIT_NAMES |= {"s": 1e9, "sec": 1e9, "secs": 1e9, "seconds": 1e9}
+STAMP_UNITS = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6,
+               "msec": 1e6, "millis": 1e6, "milliseconds": 1e6, "s": 1e9, "sec": 1e9, "secs": 1e9,
+               "seconds": 1e9}  # fmt: skip
 _TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp", "sec", "secs", "seconds", "utime"}
 _TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot", "ori", "o"}
 _PLACES = {"p", "pos", "position", "t", "translation", "trans", "location"}
@@ -59,8 +60,11 @@ def named_columns(path: Path, names: list[str]) -> NamedColumns | None:
         which = [name for name, role in zip(names, roles, strict=True) if role[:1] == "p" or role in twice]
         raise DataError(f"{path}: one column of each x, y, z is wanted; it names {', '.join(which)[:120]}")
     stamp = next((k for k in stamps if "stamp" in names[k].lower()), stamps[0])
-    unit_ns, nanos = next((_UNIT_NAMES[w] for w in _words(names[stamp])[1:] if w in _UNIT_NAMES), None), None
-    if (nanos := _nanos_of(names, stamp)) is not None:
+    nanos, unit_ns = (
+        _nanos_of(names, stamp),
+        next((STAMP_UNITS[w] for w in _words(names[stamp])[1:] if w in STAMP_UNITS), None),
+    )
+    if nanos is not None:
         unit_ns = 1e9
     in_degrees = False
     if len(turn) != 4:

@@ -21,6 +21,7 @@ from vislam.core.reading import open_file
 from vislam.core.trajectory import Trajectory
 from vislam.trajectory.formats import (
     data_lines,
+    is_number,
     kitti_poses,
     read_kitti_times,
     stamp_ns,
@@ -165,7 +166,7 @@ def _layout(path: Path) -> _Layout:
     width = len(rows[0])
     names = next((whole for n in headers if (whole := whole_names(n, width))), [])
     names = names or next((n for n in headers if len(n) == width), [])
-    has_header = not any(_is_number(field) for field in rows[0])
+    has_header = not any(is_number(field) for field in rows[0])
     if has_header:
         names, rows = rows[0], rows[1:]
     named = named_columns(path, names)
@@ -230,7 +231,7 @@ def _by_numbers(
 
 def _has_quaternion(rows: list[list[str]]) -> bool:
     """Return whether columns 5 to 8 of most rows have norm 1, or are zero or NaN as where no rotation is given."""
-    turns = np.array([[float(f) if _is_number(f) else np.inf for f in row[4:8]] for row in rows if len(row) >= 8])
+    turns = np.array([[float(f) if is_number(f) else np.inf for f in row[4:8]] for row in rows if len(row) >= 8])
     norms = np.linalg.norm(turns, axis=1)
     return bool(np.mean((np.abs(norms - 1.0) < 0.1) | (norms == 0.0) | np.isnan(norms)) > 0.5)
 
@@ -242,7 +243,7 @@ def _is_pose(twelve: Array) -> bool:
 
 def _unit_ns(rows: list[list[str]], column: int) -> float:
     """Return the unit of stamps by how large they are and how far apart."""
-    stamps = np.array([float(row[column]) for row in rows if len(row) > column and _is_number(row[column])])
+    stamps = np.array([float(row[column]) for row in rows if len(row) > column and is_number(row[column])])
     stamps = stamps[np.isfinite(stamps)]
     if not len(stamps):
         return 1e9
@@ -252,14 +253,6 @@ def _unit_ns(rows: list[list[str]], column: int) -> float:
             return unit_ns
     steps = np.abs(np.diff(stamps))
     return 1.0 if len(steps) and np.median(steps) >= _NS_STEP else 1e9
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return "_" not in field
 
 
 def _fields(line: str, separator: str | None) -> list[str]:

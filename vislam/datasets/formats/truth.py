@@ -16,8 +16,7 @@ from vislam.core.geometry import rotation_from_quaternion_xyzw
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets.images import Stamps
-from vislam.datasets.imu_tables import header
-from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, in_time_order, parse_seconds, read_numbers
+from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, header, in_time_order, parse_seconds, read_numbers
 from vislam.trajectory import Trajectory, read_kitti
 from vislam.trajectory.formats import gives_rotation
 from vislam.trajectory.named_columns import named_columns
