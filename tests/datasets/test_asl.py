@@ -298,6 +298,16 @@ def test_a_scale_or_clock_in_any_sensors_file_is_refused_and_a_truth_in_another_
                 open_dataset(str(tmp_path)).truth()
 
 
+@pytest.mark.parametrize("names", ["a_x,a_y,a_z,w_x,w_y,w_z", "linear x,y,z,angular x,y,z", "wx [deg/s],wy,wz,ax,ay,az",
+                                   "wx,wy,wz,ax_g,ay_g,az_g"])  # fmt: skip
+def test_a_table_that_names_forces_first_or_other_units_is_refused(names: str, tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=2)
+    rows = (root / "imu0" / "data.csv").read_text().partition("\n")[2]
+    (root / "imu0" / "data.csv").write_text(f"#timestamp [ns],{names}\n{rows}")
+    with pytest.raises(DataError, match=r"data.csv: its header names .*; write rates x, y, z in rad/s, then forces"):
+        list(open_dataset(str(tmp_path)).events())
+
+
 def test_mocap_truth_is_the_body_and_survives_a_cut(tmp_path: Path) -> None:
     root = write_asl(tmp_path, frames=2)
     (root / "mocap0").mkdir()

@@ -104,6 +104,20 @@ def pair_in(folder: Path, beginning: str = "") -> tuple[Pair, Finding] | None:
     raise DataError(f"{folder} holds {named}: which are the gyroscope's and the accelerometer's? Leave one of each")
 
 
+def check_names(path: Path) -> None:
+    """Raise DataError where the header of a table of rates (rad/s), then forces (m/s^2), names others."""
+    names = header(path)
+    if len(names) < 7:
+        return
+    rates, forces = names[1].lower(), names[4].lower()
+    is_swapped = re.search(r"^a[_xyz]|acc|force|linear", rates) and re.search(r"^w|gyr|omega|angular", forces)
+    if is_swapped or any(re.search(pattern, rates) or re.search(pattern, forces) for pattern, _, _ in _FACTORS):
+        raise DataError(
+            f"{path}: its header names {names[1]}, then {names[4]}; write rates x, y, z in rad/s, then forces x, y, z "
+            "in m/s^2"
+        )
+
+
 def holds_pair(folder: Path) -> bool:
     """Return whether a folder has a file of rates and one of forces."""
     return all(next(_files(folder, *kinds), None) for kinds in (("gyr", "acc"), ("acc", "gyr")))
