@@ -612,8 +612,9 @@ def _calibrations() -> list[dict[str, bytes]]:
         b"imu_params:\n  sigma_g_c: 1e-3\n  sigma_a_c: 1e-2\n  sigma_gw_c: 1e-5\n  sigma_aw_c: 1e-4\n  s_a: [1, 1, 1]\n"
     )
     maplab = (
-        b"cameras:\n- camera:\n    image_height: 6\n    image_width: 8\n    line-delay-nanoseconds: 9\n    type: pinhole\n"
-        b"    intrinsics: {data: [5, 5, 4, 3]}\n    distortion: {type: equidistant, parameters: {data: [0, 0, 0, 0]}}\n"
+        b"cameras:\n- camera:\n    image_height: 6\n    image_width: 8\n    line-delay-nanoseconds: 9\n"
+        b"    type: pinhole\n    intrinsics: {data: [5, 5, 4, 3]}\n"
+        b"    distortion: {type: equidistant, parameters: {data: [0, 0, 0, 0]}}\n"
         b"  T_B_C: {data: " + rows + b"}\n"
     )
     pair = b"image_width: 8\nimage_height: 6\nT: [0.1, 0, 0]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n" + b"".join(

@@ -43,7 +43,7 @@ def judged_turns_of(
     return judged_turns(rig.cameras[camera], R_body_cam, tracks, rows, bias, f"cam{camera}")
 
 
-def contradicted_extrinsics(recording: Recording, seen: Sequence[tuple[ImageU8, ...]]) -> tuple[str, ...]:
+def contradicted_extrinsics(recording: Recording, seen: Sequence[tuple[ImageU8, ...]] = ()) -> tuple[str, ...]:
     """Return what contradicts the places of the cameras that a run read, and what to do then.
 
     Args:
