@@ -233,6 +233,7 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
     [
         (basalt("fov"), "Basalt's camera model fov is not supported"),
         (basalt(T_cam_mocap=1.0), "not read: T_cam_mocap"),
+        (PAIR.replace("D1", "D3"), "D1 must be a list of finite numbers, got None"),
         (PAIR + "scale: 2\n", "not read: scale; .*write R and T"),
         (OKVIS.replace("T_SC", "T_SC_old: [1], T_SC"), "not read: T_SC_old"),
         (basalt().replace('"px"', '"x"'), "looks like a file of Basalt.*no 'px'"),

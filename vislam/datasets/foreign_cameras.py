@@ -347,7 +347,7 @@ def _opencv_pair(data: Keys, path: Path) -> list[CameraCalibration]:
         )
     cameras = []
     for k in "12":
-        K, d = (next(named[of + k] for of in names if of + k in named) for names in _PAIR)
+        K, d = (next((named[of + k] for of in names if of + k in named), names[0].upper() + k) for names in _PAIR)
         cameras.append(ros_camera(
             (int(data[size[0]]), int(data[size[1]])), np.reshape(numbers_in(data, K, path, 9), (3, 3)), _RATIONAL,
             numbers_in(data, d, path), str(path)))  # fmt: skip
