@@ -176,7 +176,7 @@ def header(
                 names = tuple(name.strip(' #\t"') for name in line.split(separator))
                 if fits(names) if fits else len(names) >= 4 and not any(map(is_number, names)):
                     return names
-    except OSError:  # which reading says
+    except OSError:  # which reading reports
         return ()
     return ()
 
