@@ -398,7 +398,9 @@ def _trajectories() -> list[dict[str, bytes]]:
     euroc = "#timestamp,x,y,z,qw,qx,qy,qz\n" + "".join(f"{14 * 10**17 + i},{i},0,1,1,0,0,0\n" for i in range(30))
     kitti = "1 0 0 1 0 1 0 2 0 0 1 3\n" * 20
     times = "".join(f"{i / 10:.6e}\n" for i in range(20))
-    return [{"a.tum": tum.encode()}, {"a.csv": euroc.encode()}, {"a.txt": kitti.encode(), "times.txt": times.encode()}]
+    angles = "t_s,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n" + "".join(f"{i},{i},0,1,0,9,{i}\n" for i in range(30))
+    texts = {"a.tum": tum}, {"a.csv": euroc}, {"a.csv": angles}, {"a.txt": kitti, "times.txt": times}
+    return [{name: text.encode() for name, text in files.items()} for files in texts]
 
 
 def _read_trajectories(folder: Path) -> None:
@@ -603,7 +605,23 @@ def _calibrations() -> list[dict[str, bytes]]:
         b"<camera_matrix><data>5 0 4 0 5 3 0 0 1</data></camera_matrix>\n"
         b"<distortion_coefficients><data>0 0 0 0</data></distortion_coefficients></opencv_storage>"
     )
-    all_ = (chain, info, _SENSOR, _IMU, memory, orb, vins, basalt, xml)
+    rows = b"[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
+    okvis = (
+        b"cameras:\n  - {T_SC: " + rows + b", image_dimension: [8, 6], distortion_coefficients: [0, 0, 0, 0],\n"
+        b"     distortion_type: radialtangential, focal_length: [5, 5], principal_point: [4, 3]}\nimageDelay: 0.1\n"
+        b"imu_params:\n  sigma_g_c: 1e-3\n  sigma_a_c: 1e-2\n  sigma_gw_c: 1e-5\n  sigma_aw_c: 1e-4\n  s_a: [1, 1, 1]\n"
+    )
+    maplab = (
+        b"cameras:\n- camera:\n    image_height: 6\n    image_width: 8\n    line-delay-nanoseconds: 9\n"
+        b"    type: pinhole\n    intrinsics: {data: [5, 5, 4, 3]}\n"
+        b"    distortion: {type: equidistant, parameters: {data: [0, 0, 0, 0]}}\n"
+        b"  T_B_C: {data: " + rows + b"}\n"
+    )
+    pair = b"image_width: 8\nimage_height: 6\nT: [0.1, 0, 0]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n" + b"".join(
+        b"M%d: [5, 0, 4, 0, 5, 3, 0, 0, 1]\nD%d: [0, 0, 0, 0, 0]\n" % (k, k) for k in (1, 2)
+    )
+    result = b"imu0:\n  T_i_b: " + rows + b"\n  time_offset: 0.0\n  rostopic: /imu0\n  " + _IMU.replace(b"\n", b"\n  ")
+    all_ = (chain, info, _SENSOR, _IMU, memory, orb, vins, basalt, xml, okvis, maplab, pair, result)
     return [{"c.yaml": text} for text in all_]
 
 

@@ -23,9 +23,8 @@ from vislam.datasets.calibrated import with_clock
 from vislam.datasets.calibration_text import camera_text, imu_text
 from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text, read_cameras
 from vislam.datasets.imu_files import (
-    imu_calibration_text,
+    calibration_text,
     imu_noise_text,
-    mag_calibration_text,
     read_imu_calibration,
     read_mag_calibration,
     read_noise,
@@ -156,7 +155,7 @@ def test_openvins_writes_the_pose_that_kalibr_inverts() -> None:
 )
 def test_a_pose_clock_or_scale_that_is_not_known_is_refused_by_name(make: Callable[[str], str], key: str) -> None:
     path = written(make(key))
-    with pytest.raises(DataError, match=rf"{path}: the meaning of {key} is not known.*write T_"):
+    with pytest.raises(DataError, match=rf"{path}: not read: {key}.*write T_"):
         read_cameras(path)
 
 
@@ -232,10 +231,10 @@ def test_imu_and_mag_files_read_back(b: np.ndarray, A: np.ndarray, c: np.ndarray
     if min(abs(np.linalg.det(A)), abs(np.linalg.det(B))) < 1e-3:
         return
     given_imu = ImuCalibration(b, c, A, B)
-    found = read_imu_calibration(written(imu_calibration_text(given_imu, "x")))
+    found = read_imu_calibration(written(calibration_text(given_imu, "x")))
     for name in ("gyro_bias_rad_s", "accel_bias_m_s2", "gyro_matrix", "accel_matrix"):
         assert np.array_equal(getattr(found, name), getattr(given_imu, name))
-    mag = read_mag_calibration(written(mag_calibration_text(MagCalibration(b, A), "x")))
+    mag = read_mag_calibration(written(calibration_text(MagCalibration(b, A), "x")))
     assert np.array_equal(mag.bias_ut, b) and np.array_equal(mag.matrix, A)
     sample = ImuSample(0, b, c)
     both = given_imu.apply_to(np.concatenate([b, c])[None])[0]
@@ -245,7 +244,7 @@ def test_imu_and_mag_files_read_back(b: np.ndarray, A: np.ndarray, c: np.ndarray
 
 @pytest.mark.parametrize(
     "text",
-    ["gyro_bias_rad_s: [0, 0, 0]\n", "a: 1\n", imu_calibration_text(ImuCalibration(), "").replace("1.0", "0.0")],
+    ["gyro_bias_rad_s: [0, 0, 0]\n", "a: 1\n", calibration_text(ImuCalibration(), "").replace("1.0", "0.0")],
 )
 def test_partial_or_singular_imu_files_are_refused(text: str) -> None:
     with pytest.raises(DataError, match="calibrat"):
@@ -264,9 +263,13 @@ def test_kalibrs_results_of_imus_are_read_and_what_is_not_used_is_named(caplog: 
     )
     assert read_noise(written(f"imu0:\n  {block}{still}")) == NOISE
     assert not caplog.records
-    path = written(f"imu0:\n  {block}  Tw: [[1, 0, 0], [0, 1.1, 0], [0, 0, 1]]\n  time_offset: 0.01\n")
-    assert read_noise(path) == NOISE
-    assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: Tw, time_offset"]
+    assert read_noise(path := written(f"imu0:\n  {block}  gamma: 2.0\n")) == NOISE
+    assert [record.getMessage() for record in caplog.records] == [f"{path}: not used: gamma"]
+    shifted = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    for key in (f"T_i_b: {shifted}", "Tw: [[1, 0, 0], [0, 1.1, 0], [0, 0, 1]]", "time_offset: 0.01",
+                "accelerometers: {M: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}"):  # fmt: skip
+        with pytest.raises(DataError, match=f"not read: {key.split(':')[0]}; .*--calibration.imu"):
+            read_noise(written(f"imu0:\n  {block}  {key}\n"))
     with pytest.raises(DataError, match="holds 2 IMUs: imu0, imu1; give"):
         read_noise(written(f"imu0:\n  {block}imu1:\n  {block}"))
     two = written(f"imu0:\n  {block}imu1:\n  {block}".replace("/imu0", "/left/imu", 1))
@@ -301,9 +304,9 @@ def calibration_files(folder: Path) -> CalibrationConfig:
     new = replace(CAMERA, fx=77.0)
     texts = {
         "camera": camchain_text([CameraCalibration(new, T, 0.012, 0.0005)], ""),
-        "imu": imu_calibration_text(CALIBRATION, ""),
+        "imu": calibration_text(CALIBRATION, ""),
         "imu_noise": imu_noise_text(replace(NOISE, accelerometer_noise_density=0.5), ""),
-        "mag": mag_calibration_text(MagCalibration(np.array([10.0, 20.0, 20.0]), 3.0 * np.eye(3)), ""),
+        "mag": calibration_text(MagCalibration(np.array([10.0, 20.0, 20.0]), 3.0 * np.eye(3)), ""),
     }
     for name, text in texts.items():
         (folder / f"{name}.yaml").write_text(text)
@@ -323,7 +326,7 @@ def test_a_recording_is_seen_with_the_files_that_are_named(tmp_path: Path) -> No
 
 
 def test_a_recordings_own_sensor_file_may_say_that_samples_are_raw(tmp_path: Path) -> None:
-    text = "\n".join(imu_calibration_text(CALIBRATION, "").splitlines()[2:]) + "\n"
+    text = "\n".join(calibration_text(CALIBRATION, "").splitlines()[2:]) + "\n"
     recording = open_dataset(str(raw_recording(tmp_path / "r", text)))
     imu = next(value for value in recording.events() if isinstance(value, ImuSample))
     assert imu.accel_m_s2 == pytest.approx([2.0, 4.0, 8.0])

@@ -14,7 +14,7 @@ from vislam.core.camera import Camera
 from vislam.core.errors import DataError
 from vislam.core.geometry import se3_exp
 from vislam.datasets.camera_files import CameraCalibration, camchain_text, read_cameras
-from vislam.datasets.imu_files import imu_calibration_text, mag_calibration_text
+from vislam.datasets.imu_files import calibration_text
 from vislam.hw.sensors import calibration_of
 from vislam.imu import ImuCalibration, MagCalibration
 from vislam.live.web.updates import Asked
@@ -42,7 +42,7 @@ def test_the_chips_of_the_source_get_what_was_found_and_keep_their_axes(tmp_path
     ]
     own = replace(getattr(before.sensors, section), calibration=turned)
     before = replace(before, sensors=replace(before.sensors, **{section: own}))
-    (tmp_path / "imu.yaml").write_text(imu_calibration_text(IMU, ""))
+    (tmp_path / "imu.yaml").write_text(calibration_text(IMU, ""))
     after, use = before.calibrated("imu", tmp_path)
     told = calibration_of(inertial, after.sensors)
     assert told.gyro_axes == ("y", "-x", "z") and told.mag_bias_ut == (1.0, 2.0, 3.0)
@@ -50,7 +50,7 @@ def test_the_chips_of_the_source_get_what_was_found_and_keep_their_axes(tmp_path
     others = [name for name in ("gy85", "serial", "board", "realsense", "oak") if name != section]
     assert all(getattr(after.sensors, name) == getattr(before.sensors, name) for name in others)
     assert "begins with it" in use
-    (tmp_path / "mag.yaml").write_text(mag_calibration_text(MagCalibration(np.array([5.0, 6.0, 7.0])), ""))
+    (tmp_path / "mag.yaml").write_text(calibration_text(MagCalibration(np.array([5.0, 6.0, 7.0])), ""))
     after, _ = after.calibrated("mag", tmp_path)
     told = calibration_of(inertial, after.sensors)
     assert told.mag_bias_ut == (5.0, 6.0, 7.0) and np.allclose(told.accel_matrix, IMU.accel_matrix)

@@ -35,6 +35,14 @@ def forged(data: bytes, width: int, height: int) -> bytes:
     return data[:at] + height.to_bytes(2, "big") + width.to_bytes(2, "big") + data[at + 4 :]
 
 
+def test_a_png_whose_chunk_is_longer_than_the_file_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = cv2.imencode(".png", picture(1))[1].tobytes()
+    assert decoded(data + b"rest", cv2.IMREAD_GRAYSCALE) is not None
+    monkeypatch.setattr(cv2, "imdecode", None)  # which takes as much memory as a chunk states
+    for damaged in (data[:33] + b"@" + data[34:], data[:33] + data[35:], data[:-4], data[:33]):
+        assert decoded(damaged, cv2.IMREAD_GRAYSCALE) is None
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_an_image_that_states_more_than_any_camera_is_not_decoded(suffix: str) -> None:
     data = cv2.imencode(suffix, picture(1))[1].tobytes()

@@ -3,13 +3,15 @@
 import errno
 import os
 import pkgutil
+import re
 from collections.abc import Iterator
 from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from types import SimpleNamespace
 
 import vislam
-from vislam.core.errors import VislamError
+from vislam.core.errors import VislamError, storage_failure
 from vislam.hw.chips.bus import BusError
 from vislam.live.processes.child import Failure, Flag, Life, Signals, guarded
 
@@ -79,3 +81,10 @@ def test_every_error_of_the_package_crosses_processes_whole() -> None:
     finally:
         child.kill()
         child.join()
+
+
+def test_full_shared_memory_is_named_where_the_system_does_not_name_it(monkeypatch):
+    for free, words in ((0, "^/dev/shm: .*remount"), (10**9, "^No space left on device; free disk space")):
+        monkeypatch.setattr("shutil.disk_usage", lambda path, free=free: SimpleNamespace(free=free))
+        assert re.search(words, str(storage_failure(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))))
+    assert str(storage_failure(OSError(errno.ENOSPC, "full", "/x/y"))).startswith("/x/y: full; free disk space")

@@ -279,6 +279,35 @@ def test_an_imu_with_a_pose_of_its_own_becomes_the_body(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.T_world_body[0], T_world_file @ T_file_imu, atol=1e-12)
 
 
+@pytest.mark.parametrize("folder", ["depth0", "mag0", "mocap0"])
+def test_a_scale_or_clock_in_any_sensors_file_is_refused_and_a_truth_in_another_order(
+    folder: str, tmp_path: Path
+) -> None:
+    root = write_asl(tmp_path, frames=2)
+    (root / folder).mkdir(exist_ok=True)
+    row = f"{BEGIN_NS},1,2,3,0,0,0,1\n"
+    (root / folder / "data.csv").write_text(f"#timestamp [ns],x,y,z,qw,qx,qy,qz\n{row}")
+    (root / folder / "sensor.yaml").write_text("time_offset: 0.1\n")
+    with pytest.raises(DataError, match=f"{folder}/sensor.yaml: not read: time_offset; .*write (T_BS|depth)"):
+        open_dataset(str(tmp_path))
+    (root / folder / "sensor.yaml").write_text("comment: none\n")
+    for names in ("timestamp [ns],x,y,z,qx,qy,qz,qw", "t_s,x,y,z,qw,qx,qy,qz", "t,x_mm,y_mm,z_mm,qw,qx,qy,qz"):
+        (root / folder / "data.csv").write_text(f"#{names}\n{row}")
+        if folder == "mocap0":
+            with pytest.raises(DataError, match=r"mocap0/data.csv: its header names another order or unit"):
+                open_dataset(str(tmp_path)).truth()
+
+
+@pytest.mark.parametrize("names", ["a_x,a_y,a_z,w_x,w_y,w_z", "linear x,y,z,angular x,y,z", "wx [deg/s],wy,wz,ax,ay,az",
+                                   "wx,wy,wz,ax_g,ay_g,az_g"])  # fmt: skip
+def test_a_table_that_names_forces_first_or_other_units_is_refused(names: str, tmp_path: Path) -> None:
+    root = write_asl(tmp_path, frames=2)
+    rows = (root / "imu0" / "data.csv").read_text().partition("\n")[2]
+    (root / "imu0" / "data.csv").write_text(f"#timestamp [ns],{names}\n{rows}")
+    with pytest.raises(DataError, match=r"data.csv: its header names .*; write rates x, y, z in rad/s, then forces"):
+        list(open_dataset(str(tmp_path)).events())
+
+
 def test_mocap_truth_is_the_body_and_survives_a_cut(tmp_path: Path) -> None:
     root = write_asl(tmp_path, frames=2)
     (root / "mocap0").mkdir()

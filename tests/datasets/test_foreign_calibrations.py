@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import re
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +99,9 @@ ECHO = (
     "header:\n  stamp: {sec: 1, nanosec: 2}\n  frame_id: cam0\nheight: 48\nwidth: 64\ndistortion_model: plumb_bob\n"
     f"D: [-0.1, 0.01, 0.0001, 0.0002, 0.0]\nK: [{K_TEXT}]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nP: [1, 0]\nbinning_x: 0\n"
 )
-OKVIS = "imu_params:\n" + parts("  ", (1.7e-4, 2e-3, 1.9e-5, 3e-3), "sigma_g_c sigma_a_c sigma_gw_c sigma_aw_c")
+OKVIS = "imu_params:\n  imu_rate: 200\n" + parts(
+    "  ", (1.7e-4, 2e-3, 1.9e-5, 3e-3), "sigma_g_c sigma_a_c sigma_gw_c sigma_aw_c"
+)
 MAPLAB = "label: rig\ncameras:\n"
 for T, one in ((T0, FISHEYE), (T0 @ T01, RADTAN)):
     k, kind = list(one.coefficients), one.distortion.replace("radtan", "radialtangential")
@@ -172,11 +174,21 @@ def test_files_of_other_programs_are_read(
     assert not caplog.records
 
 
-@pytest.mark.parametrize("text", [OKVIS, MAPLAB], ids=["OKVIS", "maplab"])
-def test_cameras_of_okvis_and_maplab_are_read_with_their_places(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "offset_s"),
+    [
+        (OKVIS, None),
+        (OKVIS + "camera_parameters: {image_delay: 0.1}\n", -0.1),
+        (OKVIS + "imageDelay: 0.1\n", -0.1),
+        (MAPLAB, None),
+    ],
+)
+def test_cameras_of_okvis_and_maplab_are_read_with_their_places(
+    text: str, offset_s: float | None, tmp_path: Path
+) -> None:
     (tmp_path / "theirs.yaml").write_text(text)
     found = read_cameras(tmp_path / "theirs.yaml")
-    assert [one.camera for one in found] == [FISHEYE, RADTAN]
+    assert [one.camera for one in found] == [FISHEYE, RADTAN] and found[0].time_offset_s == offset_s
     assert found[0].T_body_cam == pytest.approx(T0) and found[1].T_body_cam == pytest.approx(T0 @ T01)
 
 
@@ -205,9 +217,10 @@ def test_a_pair_of_opencv_has_its_place_there_or_in_the_file_beside(tmp_path: Pa
 
 
 def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
-    for k in range(2):
-        (tmp_path / f"cam{k}_pinhole.yaml").write_text(vins_lens())
-    text = '%YAML:1.0\nimu: 1\nnum_of_cam: 2\ncam0_calib: "cam0_pinhole.yaml"\ncam1_calib: "/x/cam1_pinhole.yaml"\n'
+    (tmp_path / "848").mkdir()
+    for name in ("848/cam0_pinhole.yaml", "cam1_pinhole.yaml"):
+        (tmp_path / name).write_text(vins_lens())
+    text = '%YAML:1.0\nimu: 1\nnum_of_cam: 2\ncam0_calib: "848/cam0_pinhole.yaml"\ncam1_calib: "/x/cam1_pinhole.yaml"\n'
     poses = matrix("body_T_cam0", T0) + matrix("body_T_cam1", T0 @ T01)
     (tmp_path / "main.yaml").write_text(f"{text}{poses}td: -0.01\n")
     found = read_cameras(tmp_path / "main.yaml")
@@ -219,7 +232,10 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
     ("text", "words"),
     [
         (basalt("fov"), "Basalt's camera model fov is not supported"),
-        (basalt(T_cam_mocap=1.0), "meaning of T_cam_mocap is not known"),
+        (basalt(T_cam_mocap=1.0), "not read: T_cam_mocap"),
+        (PAIR.replace("D1", "D3"), "D1 must be a list of finite numbers, got None"),
+        (PAIR + "scale: 2\n", "not read: scale; .*write R and T"),
+        (OKVIS.replace("T_SC", "T_SC_old: [1], T_SC"), "not read: T_SC_old"),
         (basalt().replace('"px"', '"x"'), "looks like a file of Basalt.*no 'px'"),
         (OKVIS.replace("equidistant", "fov"), "OKVIS's distortion fov is not supported"),
         (MAPLAB.replace("equidistant", "fisheye"), "maplab's pinhole with fisheye is not supported"),
@@ -229,7 +245,7 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (vins_lens("SCARAMUZZA").replace("projection", "poly"), "VINS's camera model SCARAMUZZA is not supported"),
         (vins_lens("MEI").replace("xi", "x"), "looks like a file of VINS.*no 'xi'"),
         (vins_lens().replace("fx", "f"), "looks like a file of VINS.*no 'fx'"),
-        (vins_lens() + matrix("body_T_lidar", T0), "meaning of body_T_lidar is not known"),
+        (vins_lens() + matrix("body_T_lidar", T0), "not read: body_T_lidar"),
         (orb("Omni", R4, RADTAN.coefficients, ""), "ORB-SLAM's camera model Omni is not supported"),
         (orb("PinHole", R4, RADTAN.coefficients, matrix("LEFT.K", T0)), "older settings with LEFT.K"),
         (orb("PinHole", R4, RADTAN.coefficients, "").replace("Camera.width: 64\n", ""), "ORB-SLAM.*no 'Camera.width'"),
@@ -237,10 +253,11 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (ECHO.replace("binning_x: 0", "binning_x: 2"), "binning and parts of an image are not read"),
         (ECHO + "roi: {x_offset: 9, y_offset: 0}\n", "binning and parts of an image are not read"),
         (opencv(D5, size=""), "without image size; add image_width"),
-        (MAPLAB.replace("    label: c", "    time_offset: 0.1"), "meaning of time_offset is not known"),
-        (MAPLAB.replace("label: rig", "T_G_B: 1"), "meaning of T_G_B is not known"),
-        (OKVIS + "camera_parameters: {image_delay: 0.1}\n", "sign of OKVIS's image_delay is not known"),
+        (MAPLAB.replace("    label: c", "    time_offset: 0.1"), "not read: time_offset"),
+        (MAPLAB.replace("label: rig", "T_G_B: 1"), "not read: T_G_B"),
+        ('{"camera_model": "OPENCV", "fl_x": 10.0, "k1": 0.0, "k2": 0.0}', "holds camera_model, fl_x"),
         ("# oST version 5.0 parameters\n", "is ROS's ost.txt; give its ost.yaml"),
+        ("sensors:\n  - {sensor_type: NCAMERA}\n", "is maplab's file of all sensors; give the block of its NCAMERA"),
         (XML.replace("<opencv_storage>", "<!DOCTYPE x><opencv_storage>"), "no document type"),
         (XML[:-20], "cannot be read as JSON or XML"),
         ("<svg></svg>", "holds <svg>"),
@@ -258,13 +275,20 @@ def test_densities_of_other_programs_are_read_and_vins_has_none(tmp_path: Path) 
     noise = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 200.0)
     for text in (orb("PinHole", R4, RADTAN.coefficients, ""), basalt(), OKVIS.replace("params", "parameters")):
         (tmp_path / "theirs").write_text(text)
-        assert read_noise(tmp_path / "theirs") == (noise if "imu_par" not in text else replace(noise, rate_hz=0.0))
-    (tmp_path / "theirs").write_text(vins_lens() + VINS)
-    with pytest.raises(DataError, match="acc_n and gyr_n are tuned"):
-        read_noise(tmp_path / "theirs")
+        assert read_noise(tmp_path / "theirs") == noise
+    for text, words in (
+        (vins_lens() + VINS, "acc_n and gyr_n are tuned"),
+        (basalt(calib_accel_bias=[0.1] * 3 + [0.01] * 6), "not read: scale in calib_accel_bias;"),
+        (OKVIS.replace("params:\n", "params:\n  s_a: [1, 1, 1.1]\n"), "not read: scale in s_a;"),
+    ):
+        (tmp_path / "theirs").write_text(text)
+        with pytest.raises(DataError, match=words):
+            read_noise(tmp_path / "theirs")
 
 
-def test_a_pair_whose_place_is_stated_to_each_other_alone_keeps_its_baseline(tmp_path: Path) -> None:
+def test_a_pair_whose_place_is_stated_to_each_other_alone_keeps_its_baseline(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     mav0 = write_asl(tmp_path)
     rows = "".join(f"  - {row}\n" for row in np.linalg.inv(T01).tolist())
     lens = (
@@ -274,6 +298,12 @@ def test_a_pair_whose_place_is_stated_to_each_other_alone_keeps_its_baseline(tmp
     chain = tmp_path / "chain.yaml"
     chain.write_text(f"cam0:\n{lens}cam1:\n  T_cn_cnm1:\n{rows}{lens}")
     assert isinstance(read_cameras(chain)[1], CameraCalibration) and read_cameras(chain)[1].T_body_cam is None
+    placed = chain.with_name("placed.yaml")
+    placed.write_text(
+        re.sub(r"cam\d:\n", lambda found: f"{found[0]}  T_imu_cam: {np.eye(4).tolist()}\n", chain.read_text())
+    )
+    assert read_cameras(placed)[1].T_body_cam == pytest.approx(np.eye(4))
+    assert "not used: T_cn_cnm1 of cam1, which contradicts" in caplog.text
     rig = open_dataset(str(mav0), CalibrationConfig(camera=str(chain))).rig
     assert rig.T_cam0_cam1 == pytest.approx(T01) and rig.T_body_cams[0][0, 3] == 0.0
 
@@ -281,5 +311,5 @@ def test_a_pair_whose_place_is_stated_to_each_other_alone_keeps_its_baseline(tmp
 def test_a_sensor_yaml_with_another_programs_pose_is_refused(tmp_path: Path) -> None:
     mav0 = write_asl(tmp_path, stereo=False)
     (mav0 / "cam0" / "sensor.yaml").write_text(camera_yaml().replace("T_BS", "T_imu_cam"))
-    with pytest.raises(DataError, match=r"the meaning of T_imu_cam is not known.*write T_BS"):
+    with pytest.raises(DataError, match=r"not read: T_imu_cam.*write T_BS"):
         open_dataset(str(mav0))

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,14 +10,26 @@ import pytest
 from test_other_formats import write_kitti, write_tum, write_video
 
 from vislam.config import CalibrationConfig
-from vislam.core import NO_IMAGE, Frame
-from vislam.core.camera import Camera, Rig
-from vislam.core.errors import DataError, UsageError
-from vislam.core.geometry import invert, se3_exp, so3_exp, so3_log
+from vislam.core import (
+    NO_IMAGE,
+    Camera,
+    DataError,
+    Frame,
+    MaskedRecording,
+    Rig,
+    UsageError,
+    invert,
+    se3_exp,
+    so3_exp,
+    so3_log,
+)  # fmt: skip
 from vislam.datasets import open_dataset
+from vislam.datasets.calibration_text import camera_text
 from vislam.datasets.camera_turns import fit_turns, follow_turns, judged_turns
+from vislam.datasets.extrinsics import contradicted_extrinsics
 from vislam.datasets.inspect import Inspection, inspect
 from vislam.datasets.rig_checks import judged_cameras
+from vislam.live.replay import ReplaySource
 from worlds.bag_writer import from_asl, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu
 from worlds.room import ring
@@ -276,6 +289,29 @@ def test_what_explains_a_pair_that_does_not_fit_is_tried() -> None:
         (found,) = judged_cameras(Rig((CAMERA, CAMERA), T_body_cams), [images])
         assert found.next_step.startswith(step) and (found.severity == "ok") == (not step), found
         assert step or re.search(r"9\d % of (\d+) matches", found.what)
+
+
+def test_a_run_asks_what_it_saw_and_recordings_within_others(tmp_path: Path) -> None:
+    T0, T01 = np.eye(4), se3_exp(np.array([0.0, 0.1, 0.06, 0.1, 0.02, 0.0]))
+    left, right = turned_view(np.eye(3)), np.roll(turned_view(T01[:3, :3]), -10, axis=1)
+    for name, T, image in (("cam0", T0, left), ("cam1", T0 @ invert(T01), right)):
+        (tmp_path / "mav0" / name / "data").mkdir(parents=True)
+        (tmp_path / "mav0" / name / "sensor.yaml").write_text(camera_text(CAMERA, T, ""))
+        stamps = [BEGIN_NS + i * FRAME_NS for i in range(6)]
+        (tmp_path / "mav0" / name / "data.csv").write_text("".join(f"{t},{t}.png\n" for t in stamps))
+        for t in stamps:
+            cv2.imwrite(str(tmp_path / "mav0" / name / "data" / f"{t}.png"), image)
+    write_imu(tmp_path / "mav0", imu_rows(60))
+    recording = open_dataset(str(tmp_path))
+    (said,) = contradicted_extrinsics(recording, [(right, left)])  # on disk
+    assert "the extrinsics do not fit: write the inverse of " in said and "or swap their images (" in said
+    masked = MaskedRecording(MaskedRecording(recording, lambda frame: ()), lambda frame: ())
+    for played in (masked, ReplaySource(str(tmp_path))):
+        assert contradicted_extrinsics(played, []) == (said,)
+        assert contradicted_extrinsics(played, [(right, left)] * 3) == ()  # what the run saw was swapped, and fits
+    sensors = SimpleNamespace(rig=recording.rig)  # nothing on disk
+    (seen,) = contradicted_extrinsics(sensors, [(left, right)] * 3)
+    assert seen.partition("lines")[2] == said.partition("lines")[2] and contradicted_extrinsics(sensors, []) == ()
 
 
 def test_cameras_that_show_the_same_are_named_where_they_look_past_each_other() -> None:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from vislam.config import CalibrationConfig
 from vislam.core.errors import DataError
 from vislam.core.messages import Frame, ImuSample
 from vislam.datasets import open_dataset
@@ -73,6 +74,11 @@ def test_tum_folder_of_no_known_camera_wants_a_calibration(tmp_path: Path) -> No
     assert recording.rig.cameras[0].fx == 50.0
     first = next(iter(recording.events()))
     assert float(first.depth_m[0, 0]) == 5.0
+    orb = tmp_path / "orb.yaml"
+    lens = "Camera.fx: 50.0\nCamera.fy: 50.0\nCamera.cx: 31.5\nCamera.cy: 23.5\nCamera.bf: 4.0"
+    orb.write_text(f"{lens}\nCamera.width: {WIDTH}\nCamera.height: {HEIGHT}\nDepthMapFactor: 2000.0\n")
+    first = next(iter(open_dataset(str(folder), CalibrationConfig(camera=str(orb))).events()))
+    assert float(first.depth_m[0, 0]) == 2.5
 
 
 def write_kitti(folder: Path, count: int = 3) -> Path:

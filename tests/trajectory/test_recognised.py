@@ -47,6 +47,11 @@ def w_first_seconds(t: int, *v: float) -> str:
     return w_first(t, *v).replace(str(t), f"{t // 10**9}.{t % 10**9:09d}", 1)
 
 
+def angles(t: int, *v: float, unit: float = 1e3) -> str:
+    turn = Rotation.from_quat(v[3:]).as_euler("ZYX", degrees=unit > 1.0)
+    return ",".join(map(repr, [t, *(unit * x for x in v[:3]), *turn.tolist(), 7.0]))
+
+
 def text(row: Callable[..., str], head: str = "", end: str = "\n") -> str:
     return head + end.join(row(*r) for r in ROWS) + end
 
@@ -93,6 +98,16 @@ FORMS = {
             for t, T in zip(PATH.t_ns, PATH.T_world_body, strict=True)
         ),
         "stamp and matrix",
+    ),
+    "angles and millimetres": (
+        text(angles, "t_ns,x_mm,y_mm,z_mm,yaw_deg,pitch_deg,roll_deg,wz_rad_s\n"),
+        "by their names, roll pitch yaw in degrees, positions times 0.001, nanoseconds",
+    ),
+    "radians": (
+        text(lambda *r: angles(*r, unit=1.0), "# time [ns]; x (m); y; z; yaw[rad]; pitch[rad]; roll[rad]; v\n").replace(
+            ",", ";"
+        ),
+        "roll pitch yaw in radians, nanoseconds",
     ),
     "a row of NaN": (text(tum) + f"{START_NS // 10**9 + 60} nan nan nan nan nan nan nan\n", "1 rows of NaN left out"),
 }
@@ -201,6 +216,14 @@ def test_what_evo_writes_is_read_and_judged_alike(tmp_path: Path) -> None:
         (b"# time lat lon alt\n1 48 11 500\n", "latitude and longitude .* no metres; convert them"),
         (b"frame,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n", "no column is a time, the first is 'frame'; put the time"),
         (b"a,b,c\nd,e,f\n", "could not convert"),
+        (b"t,x,y,z,roll,pitch,yaw\n1,0,0,0,0,0,0\n", "roll, pitch, yaw: which rotation .* roll_deg, pitch_deg"),
+        (b"t,x,y,z,roll_deg,pitch_deg,yaw_rad\n1,0,0,0,0,0,0\n", "roll_deg, pitch_deg, yaw_rad: which rotation"),
+        (b"# t x y z rx ry rz\n1 0 0 0 0 0 0\n", "rx, ry, rz: which rotation"),
+        (b"t,x,y,z,qx,qy,qz\n1,0,0,0,0,0,0\n", "qx, qy, qz: which rotation"),
+        (b"# t x y theta\n1 0 0 0\n", "one column of each x, y, z is wanted; it names x, y"),
+        (b"t,pose0.position.x,pose0.position.y,pose0.position.z,pose1.position.x\n1,0,0,0,0\n", "names pose0.*pose1"),
+        (b"simTime,x,y,z,roll,pitch,yaw\n1,0,0,0,0,0,0\n", "roll, pitch, yaw: which rotation"),
+        (b"t,x_ft,y_ft,z_ft\n1,0,0,0\n", "x_ft, y_ft, z_ft are not all metres"),
         (b"1403636579763555,1,2,3,0.1,0.2,0.3\n", "7 numbers whose last four are no quaternion"),
         (b"1 0 0 0 0 0 0 1\n2 0 nan 0 0 0 0 1\n", "poses:2: NaN"),
         (b"1 nan nan nan nan nan nan nan\n", "only 1 rows of NaN"),
@@ -238,6 +261,8 @@ def test_quoted_fields_and_comments_in_any_encoding_are_read(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("names", ["timestamp(s) q p v bg ba cam_imu_dt num_cam etc",
+                                   "timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot cam0_trans ... "
+                                   "imu_model dw da tg wtoI atoI etc",
                                    "timestamp(s) qx qy qz qw px py pz vx vy vz etc"])  # fmt: skip
 def test_states_of_openvins_are_read_by_their_names(names: str, tmp_path: Path) -> None:
     path = tmp_path / "state_estimate.txt"

@@ -20,9 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a verb and leave the process with its exit code, soon after a signal that asks for it."""
-    gc.set_threshold(
-        50_000, 20, 50
-    )  # modules make 200,000 objects that live on, over which it would go again and again
+    gc.set_threshold(50_000)  # modules make 200,000 objects that live on, over which it would go again and again
     with interrupts.bounded():
         code = run_verb(list(sys.argv[1:] if arguments is None else arguments))
         if interrupts.has_come():

@@ -43,8 +43,18 @@ def decoded(data: bytes, flags: int, size: tuple[int, int] | None = None) -> NDA
     stated = image_size(data)
     if stated is None or not 0 < stated[0] * stated[1] <= most_pixels(len(data)) or size not in (None, stated):
         return None
+    if data.startswith(b"\x89PNG") and not _holds_its_chunks(data):
+        return None
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         return None
     return None if image is None or image.shape[1::-1] != stated else np.asarray(image)
+
+
+def _holds_its_chunks(data: bytes) -> bool:
+    """Return whether each chunk of a PNG file ends within it: the decoder takes memory by a chunk's length first."""
+    at = 8
+    while at + 12 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at + 12 <= len(data)

@@ -2,6 +2,9 @@
 
 import copyreg
 import errno
+import os
+import shutil
+from contextlib import suppress
 
 _MOST_OF_END = 1000  # characters of a message that quotes a file without end
 
@@ -66,6 +69,7 @@ class StorageError(VislamError):
     """Something could not be written: full disk, missing permission (exit code 3)."""
 
 
+_SHARED = "/dev/shm"  # memory that processes share
 _SURROUNDINGS = {
     errno.ENOSPC: "free disk space", errno.EDQUOT: "free disk space", errno.EFBIG: "raise the limit of a file's size",
     errno.EROFS: "choose another folder", errno.EACCES: "choose another folder, or get the right to use this one",
@@ -79,5 +83,10 @@ def storage_failure(error: OSError) -> StorageError | None:
     next_step = _SURROUNDINGS.get(error.errno or 0)
     if next_step is None:
         return None
-    where = f"{error.filename}: " if error.filename is not None else ""
+    name = error.filename
+    if name is None and error.errno == errno.ENOSPC:  # semaphores, too, are files there, which the system does not name
+        with suppress(OSError):
+            if shutil.disk_usage(_SHARED).free < os.sysconf("SC_PAGESIZE"):
+                name, next_step = _SHARED, "remove what fills it, or give it more (mount -o remount,size=1G /dev/shm)"
+    where = "" if name is None else f"{name}: "
     return StorageError(f"{where}{error.strerror}; {next_step}")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
@@ -37,6 +37,15 @@ class Recording(Protocol):
         ...
 
 
+@runtime_checkable
+class Wrapping(Protocol):
+    """What plays or changes another recording, and has the same cameras."""
+
+    def wrapped(self) -> Recording:
+        """Return the recording within this one."""
+        ...
+
+
 def with_camera(recording: Recording) -> Recording:
     """Return a recording; raises DataError where it has no camera."""
     if recording.rig.is_blind:
@@ -55,6 +64,10 @@ class WrappedRecording:
         self.imu_noise: ImuNoise | None = recording.imu_noise
         self.frame_count = recording.frame_count
         self.problems: dict[str, int] = recording.problems
+
+    def wrapped(self) -> Recording:
+        """Return the recording within this one."""
+        return self._recording
 
     def truth(self) -> Trajectory | None:
         """Return the recording's truth."""

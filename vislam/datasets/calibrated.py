@@ -15,8 +15,8 @@ from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets.calibration import DepthFile, parse_depth, warn_once
-from vislam.datasets.camera_files import CameraCalibration, read_cameras
-from vislam.datasets.foreign_cameras import load_keys
+from vislam.datasets.camera_files import read_cameras
+from vislam.datasets.foreign_cameras import CameraCalibration, load_keys
 from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
 from vislam.datasets.stream import KnownCamera, Survey, with_depth_format
 
@@ -117,12 +117,12 @@ def _moved(found: Survey, clocks: Sequence[float | None], of: str) -> Survey:
 
 def _with_depth(found: Survey, path: Path) -> Survey:
     """Return what a recording holds, with its depth read as the camera's file states, if it does."""
-    said = parse_depth(load_keys(path), path)
+    said = parse_depth(keys := load_keys(path), path)
     if said == DepthFile() or found.depth is None:
         return found
-    if found.streams is not None:
+    if found.streams is not None and any(str(key).startswith("depth_") for key in keys):
         raise DataError(f"{path} states how depth is read, which a bag's messages state already; leave depth_... out")
-    return with_depth_format(found, said.over(found.depth_format))
+    return found if found.streams is not None else with_depth_format(found, said.over(found.depth_format))
 
 
 def _without(found: Survey, name: str) -> dict[str, DataError]:

@@ -60,9 +60,11 @@ _SILENT = frozenset({  # keys that say nothing that an estimate could miss, or t
     "depth_offset_px", "depth_time_offset_s", "depth_camera",
     "gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix",
 })  # fmt: skip
-# a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale
+_OF_DEPTH = ("T_BS", "camera_model", "distortion_model", "distortion_coefficients", "intrinsics", "resolution")
+_DEPTH_UNITS = ("depth_units_per_m", "RGBD.DepthMapFactor", "DepthMapFactor")  # ours and ORB-SLAM's
+# a pose (T_cam_body, body_T_cam0, T_i_c, Tbc, R_BC, extrinsicRotation), a clock (timeshift_imu_cam, td) or a scale (Tw)
 WEIGHTY = re.compile(
-    r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{2}$|extrinsic|(time|stamp|clock|cam|camera|image|imu)_?(shift|offset|delay|lag)|^td$|scale",
+    r"(^|_|\.)[TRpqt]_|^[TRpqt][A-Z]{2}$|^T[a-z]{1,2}$|extrinsic|^gyroscopes$|^accelerometers$|(?i:(time|stamp|clock|cam|camera|image|imu)_?(shift|offset|delay|lag))|^td$|scale",
     re.A,
 )
 _MOST_NAMED = 12
@@ -106,10 +108,10 @@ class Keys(dict[str, Any]):
         weighty = [k for k, v in rest.items() if instead and WEIGHTY.search(k) and (isinstance(v, list | dict) or v)]
         if weighty:
             raise DataError(
-                f"{path}: the meaning of {_listed(weighty)} is not known, and without it the camera would be at the "
-                f"wrong place or time; write {instead}, or remove it"
+                f"{path}: not read: {_listed(weighty)}; without it a place, clock or scale would be wrong: write "
+                f"{instead}, or remove it"
             )
-        if unused := [key for key, value in rest.items() if not _says_nothing(value)]:
+        if unused := [key for key, value in rest.items() if not says_nothing(value)]:
             warn_once(f"{path}: not used: {_listed(unused)}")
 
 
@@ -225,8 +227,11 @@ def parse_depth(data: Mapping[str, Any], path: Path) -> DepthFile:
     nested = data.get("depth_camera")
     if nested is not None and not isinstance(nested, dict):
         raise DataError(f"{path}: depth_camera must hold {DEPTH_CAMERA_KEYS}, got {str(nested)[:80]}")
-    own = None if nested is None else parse_depth_camera(nested, path)
-    return DepthFile(optional_positive(data, "depth_units_per_m", path), invalid, offset_px, time_offset_s, own)
+    own = None if nested is None else parse_depth_camera(keys := Keys(nested), path)
+    if nested is not None:
+        keys.name_unused(path, "T_color_depth", _OF_DEPTH)
+    units = next((key for key in _DEPTH_UNITS if data.get(key) is not None), _DEPTH_UNITS[0])
+    return DepthFile(optional_positive(data, units, path), invalid, offset_px, time_offset_s, own)
 
 
 def parse_depth_camera(data: Mapping[str, Any], path: Path) -> DepthCamera:
@@ -246,8 +251,9 @@ def depth_format(path: Path, camera: Camera, usual: DepthFormat) -> DepthFormat:
 
     Depth is registered unless the file states `T_color_depth`. Raises DataError where it contradicts itself.
     """
-    data = load_yaml(path)
+    data = Keys(load_yaml(path))
     how = parse_depth(data, path).over(usual)
+    data.name_unused(path, "depth_units_per_m and T_color_depth", ("T_color_depth", *_OF_DEPTH))
     if data.get("T_color_depth") is not None:
         if data.get("registered_to") is not None:
             raise DataError(f"{path}: depth is registered_to a camera or has a T_color_depth; remove one of them")
@@ -356,14 +362,14 @@ def numbers_in(data: Mapping[str, Any], key: str, path: Path, count: int | None 
     return numbers
 
 
-def _says_nothing(value: Any) -> bool:
+def says_nothing(value: Any) -> bool:
     """Return whether a value is none, zero, one or an identity: not to use it changes nothing."""
     try:
         flat = np.array(_flat(value["data"] if isinstance(value, dict) else value), dtype=np.float64)
     except (TypeError, ValueError, KeyError, OverflowError):
         return value is None
     side = round(np.sqrt(flat.size))
-    return not flat.any() or (flat.size == side**2 and np.array_equal(flat, np.eye(side).ravel()))
+    return not flat.any() or bool((flat == 1.0).all()) or np.array_equal(flat, np.eye(side).ravel())
 
 
 def _flat(value: Any) -> list[Any]:

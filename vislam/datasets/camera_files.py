@@ -6,7 +6,6 @@ A Kalibr chain of cameras alone has no `T_cam_imu`; ROS files have no pose at al
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +24,11 @@ from vislam.datasets.calibration import (
     parse_camera,
     pose_in,
     stated_lens,
+    warn_once,
     warn_readout,
 )
 from vislam.datasets.calibration_text import list_text
-from vislam.datasets.foreign_cameras import foreign_cameras, load_keys
+from vislam.datasets.foreign_cameras import CameraCalibration, foreign_cameras, load_keys
 
 _RATIONAL = "rational_polynomial"
 _KALIBR_MODELS: dict[Distortion, str] = {
@@ -39,17 +39,6 @@ _ROS_MODELS: dict[Distortion, str] = {
     "radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob", "rational": _RATIONAL,
 }  # fmt: skip
 _FARTHEST_S = 1e9  # clocks that begin in 1970 and at boot
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraCalibration:
-    """What a file states of one camera."""
-
-    camera: Camera
-    T_body_cam: Array | None = None  # [4, 4], body is the IMU
-    time_offset_s: float | None = None  # to be added to the camera's stamps to get the IMU's time
-    time_offset_sigma_s: float | None = None
-    T_before_cam: Array | None = None  # [4, 4], in the camera before it
 
 
 def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
@@ -64,10 +53,7 @@ def read_cameras(path: Path) -> tuple[CameraCalibration, ...]:
     if isinstance(data.get("cam0"), dict):
         return _chain(data, path)
     if (foreign := foreign_cameras(data, path)) is not None:
-        return tuple(
-            CameraCalibration(one.camera, one.T_body_cam, one.time_offset_s, T_before_cam=one.T_before_cam)
-            for one in foreign
-        )
+        return tuple(foreign)
     if not {"intrinsics", "resolution"} & set(data):
         held = ", ".join(str(key)[:40] for key in list(data)[:8])
         raise DataError(f"{path} holds {held}: no camera calibration that is known; see docs/formats.md")
@@ -84,9 +70,12 @@ def _chain(data: Keys, path: Path) -> tuple[CameraCalibration, ...]:
         camera = parse_camera(entry, path, "distortion_coeffs")
         T_body_cam, T_cam_before = _place(entry, path), pose_in(entry, "T_cn_cnm1", path)
         T_before_cam = None if T_cam_before is None else invert(T_cam_before)
-        if T_body_cam is None and found and T_before_cam is not None:
-            before = found[-1].T_body_cam
-            T_body_cam = None if before is None else before @ T_before_cam
+        before = found[-1].T_body_cam if found else None
+        chained = None if before is None or T_before_cam is None else before @ T_before_cam
+        if T_body_cam is None:
+            T_body_cam = chained
+        elif chained is not None and not np.allclose(T_body_cam, chained, 0, 2e-3):
+            warn_once(f"{path}: not used: T_cn_cnm1 of {name}, which contradicts the places in the IMU")
         found.append(CameraCalibration(camera, T_body_cam, *_offset(entry, path), T_before_cam))
         line_s = optional_positive(entry, "line_delay", path, allow_zero=True) or 0.0
         warn_readout(path, "line_delay", line_s * camera.height)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
-from vislam.core.recording import Problems, Recording
+from vislam.core.messages import ImageU8
+from vislam.core.recording import Problems, Recording, Wrapping
 from vislam.datasets.camera_turns import follow_turns, judged_turns, turn_places
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.plausibility import ImuFacts, imu_facts
@@ -42,20 +43,38 @@ def judged_turns_of(
     return judged_turns(rig.cameras[camera], R_body_cam, tracks, rows, bias, f"cam{camera}")
 
 
-def contradicted_extrinsics(recording: Recording) -> tuple[str, ...]:
-    """Return what on disk contradicts the places of the cameras that a run read, and what to do then."""
-    if not isinstance(recording, FileRecording) or not recording.frame_count:
-        return ()
+def contradicted_extrinsics(recording: Recording, seen: Sequence[tuple[ImageU8, ...]] = ()) -> tuple[str, ...]:
+    """Return what contradicts the places of the cameras that a run read, and what to do then.
+
+    Args:
+        recording: is asked on disk, also where it is within others; its inertial data as they lie there.
+        seen: images of some frames that the run took, which may be other ones than on disk, if there are any.
+    """
+    inner, findings = recording, list[Finding]()
+    try:
+        while isinstance(inner, Wrapping):
+            inner = inner.wrapped()
+        is_file = isinstance(inner, FileRecording)
+        asks_seen = bool(seen) and not (is_file and inner is recording)
+        if asks_seen:
+            used = min(map(len, seen))
+            rig = Rig(recording.rig.cameras[:used], recording.rig.T_body_cams[:used])
+            findings += judged_cameras(rig, [images[:used] for images in seen])
+        if isinstance(inner, FileRecording) and inner.frame_count:
+            findings += _on_disk(inner, not asks_seen)
+    except DataError:
+        return ()  # what cannot be read is said elsewhere
+    return tuple(f"{finding.what}: {finding.next_step}" for finding in findings if finding.severity == "error")
+
+
+def _on_disk(recording: FileRecording, asks_places: bool) -> list[Finding]:
     found, frames, used = recording.survey, recording.frames, recording.cameras_read
     rig = Rig(recording.rig.cameras[:used], recording.rig.T_body_cams[:used])
 
     def rows() -> Iterator[Row[list[float]]]:
         return ((s.t_ns, [*s.gyro_rad_s, *s.accel_m_s2]) for s in recording.imu_samples(Problems()))
 
-    try:
-        findings = judged_places(found, rig, frames) if used > 1 else []
-        if recording.imu_noise is not None and len((facts := imu_facts(rows())).window_t_ns):
-            findings += [f for k in (0, *rig.further) for f in judged_turns_of(k, found, rig, frames, facts, rows)]
-    except DataError:
-        return ()  # what cannot be read is said elsewhere
-    return tuple(f"{finding.what}: {finding.next_step}" for finding in findings if finding.severity == "error")
+    findings = judged_places(found, rig, frames) if used > 1 and asks_places else []
+    if recording.imu_noise is not None and len((facts := imu_facts(rows())).window_t_ns):
+        findings += [f for k in (0, *rig.further) for f in judged_turns_of(k, found, rig, frames, facts, rows)]
+    return findings

@@ -53,6 +53,7 @@ _RESULTS = {  # what is no mapping, by how it begins
     "Calibration results": "Kalibr's report; give its camchain.yaml",
     "# oST version": "ROS's ost.txt; give its ost.yaml",
     "# Camera list": "COLMAP's cameras.txt; write a sensor.yaml, see docs/formats.md",
+    "sensors:": "maplab's file of all sensors; give the block of its NCAMERA, cameras: ..., as a file of its own",
     "[LEFT_CAM": "the settings of a ZED; write a sensor.yaml, see docs/formats.md",
 }
 _LISTED = {  # how OKVIS and maplab name distortions, as ROS does
@@ -60,18 +61,20 @@ _LISTED = {  # how OKVIS and maplab name distortions, as ROS does
     "equidistant": "equidistant", "none": "none",
 }  # fmt: skip
 _PAIR = (("m", "k", "cameramatrix"), ("d", "distcoeffs", "distortioncoefficients"))  # of OpenCV, before 1 and 2
+_OKVIS_SILENT = ("camera_type", "cam_model", "slam_use", "mapping", "mapping_rectification")
 _MAPLAB_SILENT = ("label", "id", "description", "topic", "sensor_type", "compressed")
 _MOST_BASELINE_M = 10.0  # more are millimetres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StatedCamera:
+class CameraCalibration:
     """What a file states of one camera."""
 
     camera: Camera
-    T_body_cam: Array | None = None  # [4, 4]
+    T_body_cam: Array | None = None  # [4, 4], body is the IMU
+    time_offset_s: float | None = None  # to be added to the camera's stamps to get the IMU's time
+    time_offset_sigma_s: float | None = None
     T_before_cam: Array | None = None  # [4, 4], in the camera before it
-    time_offset_s: float | None = None  # to be added to its stamps to get the IMU's time
 
 
 def load_keys(path: Path) -> Keys:
@@ -92,7 +95,7 @@ def load_keys(path: Path) -> Keys:
     return Keys(data)
 
 
-def foreign_cameras(data: Keys, path: Path) -> list[StatedCamera] | None:
+def foreign_cameras(data: Keys, path: Path) -> list[CameraCalibration] | None:
     """Return what a file of another program states of its first two cameras, None where it is none of those.
 
     Raises DataError naming the program and what it lacks, or the camera model that vislam does not have.
@@ -138,7 +141,7 @@ def ros_camera(size_px: tuple[int, int], K: Array, name: str, coefficients: list
         raise DataError(f"{where}: {error}") from error
 
 
-def _ros_or_opencv(data: Keys, path: Path) -> list[StatedCamera]:
+def _ros_or_opencv(data: Keys, path: Path) -> list[CameraCalibration]:
     named = {_OPENCV.get(str(key).lower().replace("_", ""), str(key)): value for key, value in data.items()}
     keys = Keys(named)
     K = np.array(numbers_in(keys, "camera_matrix", path, 9)).reshape(3, 3)
@@ -163,10 +166,10 @@ def _ros_or_opencv(data: Keys, path: Path) -> list[StatedCamera]:
     if roi.get("x_offset") or roi.get("y_offset") or any(keys.get(f"binning_{axis}", 0) not in (0, 1) for axis in "xy"):
         raise DataError(f"{path}: binning and parts of an image are not read; calibrate at the size that is recorded")
     keys.name_unused(path, "T_BS", known=_OPENCV_SILENT)
-    return [StatedCamera(camera, pose)]
+    return [CameraCalibration(camera, pose)]
 
 
-def _vins(data: Keys, path: Path) -> list[StatedCamera]:
+def _vins(data: Keys, path: Path) -> list[CameraCalibration]:
     td = data.get("td")
     offset_s = None if td is None else float(td)
     found = []
@@ -178,15 +181,17 @@ def _vins(data: Keys, path: Path) -> list[StatedCamera]:
                 np.reshape(numbers_in(data, "extrinsicRotation", path, 9), (3, 3)),
                 np.array(numbers_in(data, "extrinsicTranslation", path, 3)),
             )
-        found.append(StatedCamera(_vins_lens(data, path), T, time_offset_s=offset_s))
+        found.append(CameraCalibration(_vins_lens(data, path), T, time_offset_s=offset_s))
     else:
         for k in range(2):
             if data.get(f"cam{k}_calib") is not None:
-                beside = path.with_name(Path(str(data[f"cam{k}_calib"])).name)
+                named = Path(str(data[f"cam{k}_calib"]))  # relative to this file, but to no other folder than its own
+                is_inside = not named.is_absolute() and ".." not in named.parts
+                beside = path.parent / named if is_inside else path.with_name(named.name)
                 T = pose_in(data, f"body_T_cam{k}", path)
-                found.append(StatedCamera(_vins_lens(load_keys(beside), beside), T, time_offset_s=offset_s))
+                found.append(CameraCalibration(_vins_lens(load_keys(beside), beside), T, time_offset_s=offset_s))
     if str(data.get("estimate_extrinsic", 0)) == "2":  # by which the poses are placeholders
-        found = [StatedCamera(one.camera, time_offset_s=offset_s) for one in found]
+        found = [CameraCalibration(one.camera, time_offset_s=offset_s) for one in found]
     if str(data.get("rolling_shutter", 0)) == "1":
         warn_readout(path, "rolling_shutter_tr", numbers_in(data, "rolling_shutter_tr", path, 1)[0])
     _refuse_weighty(data, path, "body_T_cam0 and td")
@@ -211,7 +216,7 @@ def _vins_lens(data: Keys, path: Path) -> Camera:
     return stated_camera((size[0], size[1]), K, "omni", [float(value) for value in k], str(path))
 
 
-def _orb_slam(data: Keys, path: Path) -> list[StatedCamera]:
+def _orb_slam(data: Keys, path: Path) -> list[CameraCalibration]:
     if "LEFT.K" in data:
         raise DataError(
             f"{path}: ORB-SLAM's older settings with LEFT.K and RIGHT.K are not supported; write Camera1.fx ..., "
@@ -222,16 +227,18 @@ def _orb_slam(data: Keys, path: Path) -> list[StatedCamera]:
     T_body_cam = pose_in(data, "Tbc", path) if T_body_cam is None else T_body_cam
     T_c1_c2 = pose_in(data, "Stereo.T_c1_c2", path)
     T_c1_c2 = pose_in(data, "Tlr", path) if T_c1_c2 is None else T_c1_c2
-    found = [StatedCamera(_orb_lens(data, first, path), T_body_cam)]
+    found = [CameraCalibration(_orb_lens(data, first, path), T_body_cam)]
     if data.get("Stereo.b") is not None or (data.get("Camera.bf") is not None and "Camera2.fx" not in data):
         b_m = data.get("Stereo.b")
         b_m = float(data["Camera.bf"]) / found[0].camera.fx if b_m is None else float(b_m)
         if "DepthMapFactor" not in data and "RGBD.DepthMapFactor" not in data:  # else it is a made-up one, of depth
             T = transform(np.eye(3), np.array([b_m, 0.0, 0.0]))
-            found.append(StatedCamera(found[0].camera, None if T_body_cam is None else T_body_cam @ T, T))
-    elif "Camera2.fx" in data and T_c1_c2 is not None:
-        T = None if T_body_cam is None else T_body_cam @ T_c1_c2
-        found.append(StatedCamera(_orb_lens(data, "Camera2", path), T, T_c1_c2))
+            found.append(
+                CameraCalibration(found[0].camera, None if T_body_cam is None else T_body_cam @ T, T_before_cam=T)
+            )
+    elif "Camera2.fx" in data:
+        T = None if T_body_cam is None or T_c1_c2 is None else T_body_cam @ T_c1_c2
+        found.append(CameraCalibration(_orb_lens(data, "Camera2", path), T, T_before_cam=T_c1_c2))
     _refuse_weighty(data, path, "IMU.T_b_c1 and Stereo.T_c1_c2")
     return found
 
@@ -249,7 +256,7 @@ def _orb_lens(data: Keys, name: str, path: Path) -> Camera:
     return ros_camera((width, height), K, "none" if kind == "Rectified" else "plumb_bob", k, str(path))
 
 
-def _basalt(data: Keys, path: Path) -> list[StatedCamera]:
+def _basalt(data: Keys, path: Path) -> list[CameraCalibration]:
     keys = Keys(data["value0"])
     offset_s = float(keys.get("cam_time_offset_ns") or 0.0) * 1e-9
     lists = (keys["intrinsics"], keys["resolution"], keys["T_imu_cam"])
@@ -275,7 +282,7 @@ def _basalt(data: Keys, path: Path) -> list[StatedCamera]:
             raise DataError(f"{path}: a quaternion of T_imu_cam is not of length 1: {q.tolist()}")
         R = rotation_from_quaternion_xyzw(q[None] / np.linalg.norm(q))[0]
         T = transform(R, np.array([float(pose[f"p{axis}"]) for axis in "xyz"]))
-        found.append(StatedCamera(camera, T, time_offset_s=offset_s))
+        found.append(CameraCalibration(camera, T, time_offset_s=offset_s))
     keys.name_unused(
         path,
         "T_imu_cam and cam_time_offset_ns",
@@ -284,8 +291,10 @@ def _basalt(data: Keys, path: Path) -> list[StatedCamera]:
     return found
 
 
-def _okvis(data: Keys, path: Path) -> list[StatedCamera]:
+def _okvis(data: Keys, path: Path) -> list[CameraCalibration]:
     found = []
+    delays = (dict(data.get("camera_parameters") or {}).get("image_delay"), data.get("imageDelay"))
+    offset_s = next((-float(delay) for delay in delays if delay is not None), None)  # OKVIS subtracts it from stamps
     for entry in data["cameras"][:2]:
         keys = Keys(entry)
         width, height = numbers_in(keys, "image_dimension", path, 2)
@@ -293,18 +302,14 @@ def _okvis(data: Keys, path: Path) -> list[StatedCamera]:
         name, k = _LISTED.get(str(keys["distortion_type"]), ""), numbers_in(keys, "distortion_coefficients", path)
         if not name:
             raise DataError(f"{path}: OKVIS's distortion {keys['distortion_type']} is not supported; use {[*_LISTED]}")
-        found.append(
-            StatedCamera(ros_camera((int(width), int(height)), K, name, k, str(path)), pose_in(keys, "T_SC", path))
-        )
-    if float(dict(data.get("camera_params", data.get("camera_parameters")) or {}).get("image_delay", 0.0)):
-        raise DataError(
-            f"{path}: the sign of OKVIS's image_delay is not known; set it to 0, time offsets are estimated"
-        )
+        camera = ros_camera((int(width), int(height)), K, name, k, str(path))
+        found.append(CameraCalibration(camera, pose_in(keys, "T_SC", path), offset_s))
+        keys.name_unused(path, "T_SC", _OKVIS_SILENT)
     _refuse_weighty(data, path, "T_SC in each camera's block")
     return found
 
 
-def _maplab(data: Keys, path: Path) -> list[StatedCamera]:
+def _maplab(data: Keys, path: Path) -> list[CameraCalibration]:
     found = []
     for entry in data["cameras"][:2]:
         keys, lens = Keys(entry), Keys(entry["camera"])
@@ -317,7 +322,7 @@ def _maplab(data: Keys, path: Path) -> list[StatedCamera]:
         K = _intrinsics(*numbers_in(lens, "intrinsics", path, 4))
         k = numbers_in(distortion, "parameters", path) if "parameters" in distortion else []
         camera = ros_camera((int(lens["image_width"]), int(lens["image_height"])), K, name, k, str(path))
-        found.append(StatedCamera(camera, pose_in(keys, "T_B_C", path)))
+        found.append(CameraCalibration(camera, pose_in(keys, "T_B_C", path)))
         delay_ns = optional_positive(lens, "line-delay-nanoseconds", path, allow_zero=True) or 0.0
         warn_readout(path, "line-delay-nanoseconds", delay_ns * 1e-9 * camera.height)
         for part in (keys, lens):
@@ -326,7 +331,7 @@ def _maplab(data: Keys, path: Path) -> list[StatedCamera]:
     return found
 
 
-def _opencv_pair(data: Keys, path: Path) -> list[StatedCamera]:
+def _opencv_pair(data: Keys, path: Path) -> list[CameraCalibration]:
     """Return a pair as OpenCV's program calibrates it: R and T take points of the left camera into the right one."""
     named = {str(key).lower().replace("_", ""): str(key) for key in data}
     size = [named[key] for key in ("imagewidth", "imageheight") if key in named]
@@ -342,22 +347,23 @@ def _opencv_pair(data: Keys, path: Path) -> list[StatedCamera]:
         )
     cameras = []
     for k in "12":
-        K, d = (next(named[of + k] for of in names if of + k in named) for names in _PAIR)
+        K, d = (next((named[of + k] for of in names if of + k in named), names[0].upper() + k) for names in _PAIR)
         cameras.append(ros_camera(
             (int(data[size[0]]), int(data[size[1]])), np.reshape(numbers_in(data, K, path, 9), (3, 3)), _RATIONAL,
             numbers_in(data, d, path), str(path)))  # fmt: skip
     T = invert(transform(np.reshape(numbers_in(place, "R", path, 9), (3, 3)), t))
-    return [StatedCamera(cameras[0]), StatedCamera(cameras[1], T_before_cam=T)]
+    data.name_unused(path, "R and T in metres", (*_OPENCV_SILENT, "R1", "R2", "P1", "P2", "Q", "E", "F"))
+    return [CameraCalibration(cameras[0]), CameraCalibration(cameras[1], T_before_cam=T)]
 
 
-_PROGRAMS: tuple[tuple[str, Callable[[Keys], bool], Callable[[Keys, Path], list[StatedCamera]]], ...] = (
+_PROGRAMS: tuple[tuple[str, Callable[[Keys], bool], Callable[[Keys, Path], list[CameraCalibration]]], ...] = (
     ("Basalt", lambda data: isinstance(data.get("value0"), dict), _basalt),
     ("VINS", lambda data: "model_type" in data or "cam0_calib" in data, _vins),
     ("ORB-SLAM", lambda data: "Camera.fx" in data or "Camera1.fx" in data, _orb_slam),
     ("OKVIS", lambda data: "T_SC" in _first_of(data), _okvis),
     ("maplab", lambda data: "T_B_C" in _first_of(data), _maplab),
-    ("OpenCV", lambda data: any(f"{name}1" in (str(key).lower().replace("_", "") for key in data)
-                                for name in _PAIR[0]), _opencv_pair),
+    ("OpenCV", lambda data: any({f"{name}1", f"{name}2"} <= {str(key).lower().replace("_", "") for key in data}
+                                for name in _PAIR[0] + _PAIR[1][:1]) and "fl_x" not in data, _opencv_pair),
     ("ROS or OpenCV", lambda data: any(
         _OPENCV.get(str(key).lower().replace("_", "")) == "camera_matrix" for key in data), _ros_or_opencv),
 )  # fmt: skip

@@ -15,20 +15,26 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.calibration import NOISE_KEYS, Keys, load_yaml, numbers_in, parse_noise
+from vislam.datasets.calibration import NOISE_KEYS, SCALE_KEYS, Keys, load_yaml, numbers_in, parse_noise, says_nothing
 from vislam.datasets.calibration_text import list_text
 from vislam.datasets.foreign_cameras import load_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 Calibration = TypeVar("Calibration", ImuCalibration, MagCalibration)
 
-_IMU_KEYS = {"gyro_bias_rad_s": 3, "accel_bias_m_s2": 3, "gyro_matrix": 9, "accel_matrix": 9}
-_MAG_KEYS = {"mag_bias_ut": 3, "mag_matrix": 9}
+_KEYS: dict[type, dict[str, str]] = {  # of files, and what they are called in the value
+    ImuCalibration: {key: key for key in ("gyro_bias_rad_s", "gyro_matrix", "accel_bias_m_s2", "accel_matrix")},
+    MagCalibration: {"mag_bias_ut": "bias_ut", "mag_matrix": "matrix"},
+}
 _ORB_NOISE = dict(
     zip(("IMU.NoiseGyro", "IMU.NoiseAcc", "IMU.GyroWalk", "IMU.AccWalk"), NOISE_KEYS, strict=True),
     **{"IMU.Frequency": "update_rate"},
 )
-_OKVIS_NOISE = dict(zip(("sigma_g_c", "sigma_a_c", "sigma_gw_c", "sigma_aw_c"), NOISE_KEYS, strict=True))
+_OKVIS_NOISE = dict(
+    zip(("sigma_g_c", "sigma_a_c", "sigma_gw_c", "sigma_aw_c"), NOISE_KEYS, strict=True), imu_rate="update_rate"
+)
+_BIASES = {"calib_accel_bias": 3, "calib_gyro_bias": 3, "a0": 3, "g0": 3, "s_a": 0}  # numbers; behind: scale and axes
+_INSTEAD = "poses of cameras in this IMU and its scale in a file for --calibration.imu"
 _BASALT_NOISE = dict(
     zip(("gyro_noise_std", "accel_noise_std", "gyro_bias_std", "accel_bias_std"), NOISE_KEYS, strict=True),
     imu_update_rate="update_rate",
@@ -51,9 +57,8 @@ def imu_noise_text(noise: ImuNoise, comment: str) -> str:
 def read_noise(path: Path, topic: str = "") -> ImuNoise:
     """Return the noise model in a file of Kalibr (also its results), OpenVINS, ORB-SLAM, Basalt, or an ASL sensor.yaml.
 
-    Of several IMUs it is the one whose `rostopic` is `topic`. What the file states of the IMU beside its noise (T_i_b,
-    time_offset, Tw) is warned of where it means anything.
-    Raises DataError naming the key.
+    Of several IMUs it is the one whose `rostopic` is `topic`. Raises DataError naming the key; also for a place, clock
+    or scale of the IMU (T_i_b, time_offset, Tw) that means anything. Other keys that are not used are warned of.
     """
     data = _foreign_noise(load_keys(path), path)
     nested = [str(key) for key, value in data.items() if isinstance(value, dict) and set(NOISE_KEYS) & set(value)]
@@ -65,7 +70,7 @@ def read_noise(path: Path, topic: str = "") -> ImuNoise:
         data.name_unused(path, known=nested)
         data = Keys(data[chosen[0]])
     noise = parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
-    data.name_unused(path, known=("model",))
+    data.name_unused(path, _INSTEAD, known=("model", *(key for key, value in data.items() if says_nothing(value))))
     return noise
 
 
@@ -84,75 +89,58 @@ def _foreign_noise(data: Keys, path: Path) -> Keys:
     for names, holder in ((_BASALT_NOISE, inner), (_ORB_NOISE, data), (_OKVIS_NOISE, listed)):
         if isinstance(holder, dict) and any(name in holder for name in names):
             stated = {key: numbers_in(holder, name, path) for name, key in names.items() if name in holder}
-            return Keys({key: max(values, default=None) for key, values in stated.items()})
+            rest = {name: numbers_in(holder, name, path) for name in _BIASES if name in holder}
+            scales = {f"scale in {name}": values[_BIASES[name] :] for name, values in rest.items()}
+            biases = {name: values[: _BIASES[name]] for name, values in rest.items()}
+            return Keys({key: max(values, default=None) for key, values in stated.items()} | biases | scales)
     return data
 
 
-def imu_calibration_text(calibration: ImuCalibration, comment: str) -> str:
-    """Return the file of an IMU's calibration."""
-    return f"sensor_type: imu\ncomment: {json.dumps(comment)}\n{imu_calibration_keys(calibration)}"
+def calibration_text(calibration: ImuCalibration | MagCalibration, comment: str) -> str:
+    """Return the file of a calibration."""
+    sensor = "imu" if isinstance(calibration, ImuCalibration) else "magnetometer"
+    return f"sensor_type: {sensor}\ncomment: {json.dumps(comment)}\n{calibration_keys(calibration)}"
 
 
-def imu_calibration_keys(calibration: ImuCalibration) -> str:
-    """Return the lines that say, in any sensor file, that samples are raw and how they are calibrated."""
-    return (
-        "# calibrated = matrix @ (raw - bias); matrices by row\n"
-        f"gyro_bias_rad_s: {list_text(calibration.gyro_bias_rad_s)}\n"
-        f"gyro_matrix: {_rows(calibration.gyro_matrix)}\n"
-        f"accel_bias_m_s2: {list_text(calibration.accel_bias_m_s2)}\n"
-        f"accel_matrix: {_rows(calibration.accel_matrix)}\n"
-    )
-
-
-def mag_calibration_text(calibration: MagCalibration, comment: str) -> str:
-    """Return the file of a magnetometer's calibration."""
-    return f"sensor_type: magnetometer\ncomment: {json.dumps(comment)}\n{mag_calibration_keys(calibration)}"
-
-
-def mag_calibration_keys(calibration: MagCalibration) -> str:
-    """Return the lines that say, in any sensor file, that the field is raw and how it is calibrated."""
-    return (
-        "# calibrated = matrix @ (raw - bias); matrix by row\n"
-        f"mag_bias_ut: {list_text(calibration.bias_ut)}\n"
-        f"mag_matrix: {_rows(calibration.matrix)}\n"
-    )
+def calibration_keys(calibration: ImuCalibration | MagCalibration) -> str:
+    """Return the lines that state, in any sensor file, that samples are raw and how they are calibrated."""
+    values = {key: getattr(calibration, name) for key, name in _KEYS[type(calibration)].items()}
+    lines = (f"{key}: {_rows(value) if value.ndim == 2 else list_text(value)}\n" for key, value in values.items())
+    matrices = "matrices" if len(values) > 2 else "matrix"
+    return f"# calibrated = matrix @ (raw - bias); {matrices} by row\n{''.join(lines)}"
 
 
 def read_imu_calibration(path: Path) -> ImuCalibration:
     """Return the calibration of an IMU in a file; raises DataError when it holds none."""
-    return _wanted(imu_calibration(load_yaml(path), path), path, _IMU_KEYS, "imu")
+    return _wanted(path, ImuCalibration, "imu")
 
 
 def read_mag_calibration(path: Path) -> MagCalibration:
     """Return the calibration of a magnetometer in a file; raises DataError when it holds none."""
-    return _wanted(mag_calibration(load_yaml(path), path), path, _MAG_KEYS, "mag")
+    return _wanted(path, MagCalibration, "mag")
 
 
-def imu_calibration(data: Mapping[str, Any], path: Path) -> ImuCalibration | None:
+def calibration_in(data: Mapping[str, Any], path: Path, of: type[Calibration]) -> Calibration | None:
     """Return the calibration in the keys of a sensor file, None without any; raises DataError when some are missing."""
-    values = _values(data, path, _IMU_KEYS)
-    return None if values is None else ImuCalibration(**values)
-
-
-def mag_calibration(data: Mapping[str, Any], path: Path) -> MagCalibration | None:
-    """Return the calibration in the keys of a sensor file, None without any; raises DataError when some are missing."""
-    values = _values(data, path, _MAG_KEYS)
-    return None if values is None else MagCalibration(values["mag_bias_ut"], values["mag_matrix"])
-
-
-def _values(data: Mapping[str, Any], path: Path, keys: Mapping[str, int]) -> dict[str, Array] | None:
-    there = [key for key in keys if data.get(key) is not None]
+    there = [key for key in _KEYS[of] if data.get(key) is not None]
     if not there:
         return None
-    if missing := [key for key in keys if key not in there]:
+    if missing := [key for key in _KEYS[of] if key not in there]:
         raise DataError(f"{path} holds {', '.join(there)} but not {', '.join(missing)}; calibrate again")
-    arrays = {key: np.array(numbers_in(data, key, path, count)) for key, count in keys.items()}
-    return {key: value.reshape(3, 3) if len(value) == 9 else value for key, value in arrays.items()}
+    values = {
+        name: np.array(numbers_in(data, key, path, 9)).reshape(3, 3)
+        if key.endswith("matrix")
+        else np.array(numbers_in(data, key, path, 3))
+        for key, name in _KEYS[of].items()
+    }
+    return of(**values)
 
 
-def _wanted(found: Calibration | None, path: Path, keys: Mapping[str, int], kind: str) -> Calibration:
+def _wanted(path: Path, of: type[Calibration], kind: str) -> Calibration:
+    found = calibration_in(data := Keys(load_yaml(path)), path, of)
     if found is None:
-        raise DataError(f"{path} holds none of {', '.join(keys)}; `vislam calibrate {kind}` writes such a file")
+        raise DataError(f"{path} holds none of {', '.join(_KEYS[of])}; `vislam calibrate {kind}` writes such a file")
+    data.name_unused(path, known=(*NOISE_KEYS, *SCALE_KEYS, "rate_hz"))
     return found
 
 

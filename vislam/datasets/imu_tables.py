@@ -21,16 +21,14 @@ from vislam.core.messages import Array
 from vislam.core.reading import open_file
 from vislam.core.recording import Problems
 from vislam.datasets.imu_pairs import Rows, paired
-from vislam.datasets.tables import MAX_LINE_BYTES, Row, in_time_order, parse_ns, parse_seconds, read_rows
+from vislam.datasets.tables import MAX_LINE_BYTES, Row, header, in_time_order, parse_ns, parse_seconds, read_rows
+from vislam.trajectory.formats import is_number
+from vislam.trajectory.named_columns import STAMP_UNITS
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-_HEADER_LINES = 5
 _LOOKED_AT = 100  # rows, for order and unit of stamps
 _OTHERS = ("lin", "uncal", "user", "bias", "temp")  # forces without gravity, raw samples, what is no sample
 _LEAST_STEPS = ((0.2, "s", 1e9), (200.0, "ms", 1e6), (2e5, "us", 1e3))  # of 5 Hz; 5 kHz is a step in the unit below
-_STAMP_UNITS = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6,
-                "msec": 1e6, "millis": 1e6, "milliseconds": 1e6, "s": 1e9, "sec": 1e9, "secs": 1e9,
-                "seconds": 1e9}  # fmt: skip
 _AXES = {axis: {of + axis for of in ("", "g", "a", "w", "r", "acc", "accel", "gyr", "gyro", "omega")} for axis in "xyz"}
 _FACTORS = ((r"deg|°|dps", math.pi / 180.0, "deg/s"), (r"[\[(_ ](milli-?g|mg)\b", STANDARD_GRAVITY_M_S2 * 1e-3, "mg"),
             (r"[\[(_ ]g\b", STANDARD_GRAVITY_M_S2, "g"))  # fmt: skip
@@ -61,6 +59,8 @@ class Table:
         found = read_rows(self.path, parse, problems, self.separator, needs_line_end=True)
         return in_time_order(found, problems, self.path.name)
 
+    imu_rows = rows  # of rates and forces in one table
+
 
 @dataclass(frozen=True, slots=True)
 class Pair:
@@ -77,17 +77,6 @@ class Pair:
             both = paired(forces, self.gravity.rows(problems), problems, f"{self.forces.path.name} with gravity")
             forces = ((t_ns, [a + g for a, g in zip(row[:3], row[3:], strict=True)]) for t_ns, row in both)
         return paired(self.rates.rows(problems), forces, problems, self.rates.path.parent.name)
-
-
-@dataclass(frozen=True, slots=True)
-class Whole:
-    """Rates and forces in one table."""
-
-    table: Table
-
-    def imu_rows(self, problems: Problems) -> Rows:
-        """Yield stamp, rates and forces."""
-        return self.table.rows(problems)
 
 
 def pair_in(folder: Path, beginning: str = "") -> tuple[Pair, Finding] | None:
@@ -115,34 +104,23 @@ def pair_in(folder: Path, beginning: str = "") -> tuple[Pair, Finding] | None:
     raise DataError(f"{folder} holds {named}: which are the gyroscope's and the accelerometer's? Leave one of each")
 
 
+def check_names(path: Path) -> None:
+    """Raise DataError where the header of a table of rates (rad/s), then forces (m/s^2), names others."""
+    names = header(path)
+    if len(names) < 7:
+        return
+    rates, forces = names[1].lower(), names[4].lower()
+    is_swapped = re.search(r"^a[_xyz]|acc|force|linear", rates) and re.search(r"^w|gyr|omega|angular", forces)
+    if is_swapped or any(re.search(pattern, rates) or re.search(pattern, forces) for pattern, _, _ in _FACTORS):
+        raise DataError(
+            f"{path}: its header names {names[1]}, then {names[4]}; write rates x, y, z in rad/s, then forces x, y, z "
+            "in m/s^2"
+        )
+
+
 def holds_pair(folder: Path) -> bool:
     """Return whether a folder has a file of rates and one of forces."""
     return all(next(_files(folder, *kinds), None) for kinds in (("gyr", "acc"), ("acc", "gyr")))
-
-
-def header(path: Path, separator: str | None = ",") -> tuple[str, ...]:
-    """Return the names of a table's columns; empty where there is no such table, or none in its first lines."""
-    if not path.is_file():
-        return ()
-    try:
-        with open_file(path) as file:
-            for _ in range(_HEADER_LINES):
-                line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").strip(" #\r\n")
-                names = tuple(name.strip(' "') for name in line.split(separator))
-                if len(names) >= 4 and not any(map(is_number, names)):
-                    return names
-    except OSError:
-        return ()
-    return ()
-
-
-def is_number(text: str) -> bool:
-    """Return whether a field is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _files(folder: Path, kind: str, not_kind: str, beginning: str = "") -> Iterator[Path]:
@@ -208,8 +186,8 @@ def _rises(column: Array) -> bool:
 def _stamp_unit(name: str, stamps: Array) -> tuple[str, float]:
     """Return the unit of stamps in words and ns: as the column's name has it, else by the steps."""
     for word in re.findall(r"[a-z]+", name.lower()):
-        if word in _STAMP_UNITS:
-            return word, _STAMP_UNITS[word]
+        if word in STAMP_UNITS:
+            return word, STAMP_UNITS[word]
     steps = np.diff(stamps)
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     return next(((of, unit_ns) for least, of, unit_ns in _LEAST_STEPS if step < least), ("ns", 1.0))

@@ -15,6 +15,7 @@ from vislam.core.encoded_image import most_pixels
 from vislam.core.errors import DataError
 from vislam.core.messages import NO_IMAGE, ImageF32, ImageU8
 from vislam.core.reading import check_file
+from vislam.core.recording import Problems
 from vislam.datasets.images import (
     DepthFormat,
     ImageList,
@@ -198,6 +199,18 @@ def video_facts(path: Path) -> tuple[tuple[int, int], int]:
         return _video_size(capture), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     finally:
         capture.release()
+
+
+def check_film(path: Path, images: ImageList, rig: Rig | None, problems: Problems) -> None:
+    """Count frames of a film behind the last of its images, whose files are numbers of frames, and compare its size.
+
+    Raises DataError where it cannot be read, or is not of the size of the rig's camera.
+    """
+    size, frames = video_facts(path)  # some containers do not know how many; of joined films they are the first's
+    last = int(images.files[-1]) + 1 if images.files else 0
+    problems.count("video frame without a stamp", times=max(0, frames - last))
+    if rig is not None:
+        check_size_px(size, rig.cameras[0], path)
 
 
 def open_video(path: Path) -> cv2.VideoCapture:

@@ -26,7 +26,7 @@ from vislam.core.messages import Array, Frame, ImageF32, ImageU8, ImuSample, Mag
 from vislam.core.recording import Problems, Recording
 from vislam.datasets.calibration import DEPTH_UNITS_PER_M
 from vislam.datasets.calibration_text import camera_text, depth_text, imu_text, pose_text
-from vislam.datasets.imu_files import imu_calibration_keys, mag_calibration_keys
+from vislam.datasets.imu_files import calibration_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 
 ImageFormat = Literal["png", "jpg"]
@@ -81,7 +81,7 @@ class Recorder:
         self.bytes_written = 0
         self._rig = rig
         self._has_imu = imu_noise is not None
-        self._mag_keys = "" if mag_calibration is None else mag_calibration_keys(mag_calibration)
+        self._mag_keys = "" if mag_calibration is None else calibration_keys(mag_calibration)
         self._image_format: ImageFormat = image_format
         self._depth_units_per_m = depth_units_per_m
         self._logs: dict[str, _RowLog] = {}
@@ -97,7 +97,7 @@ class Recorder:
         except OSError as error:
             raise self._storage_error(error, folder) from error
         try:
-            imu_keys = "" if imu_calibration is None else imu_calibration_keys(imu_calibration)
+            imu_keys = "" if imu_calibration is None else calibration_keys(imu_calibration)
             self._make_folders(rig, imu_noise, comment, imu_keys)
         except OSError as error:
             shutil.rmtree(self._root, ignore_errors=True)  # a recording of nothing would be in the way of the next try

@@ -14,7 +14,7 @@ from vislam.core.messages import Array
 from vislam.core.reading import open_file
 from vislam.core.readings import Reading
 from vislam.core.recording import Problems
-from vislam.datasets.tables import MAX_LINE_BYTES, Row, in_time_order, parse_ns, parse_seconds, read_rows
+from vislam.datasets.tables import Row, header, in_time_order, parse_ns, parse_seconds, read_rows
 from vislam.datasets.telemetry import open_joined
 from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic, LocalFrame
@@ -22,7 +22,6 @@ from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
 from vislam.sensors.ticks import TickSpeeds
 from vislam.sensors.toml import SensorFile
 
-_HEADER_LINES = 20  # a header stands among the first ones
 _STAMPS: dict[str, Callable[[str], int]] = {"t_ns": parse_ns, "t_s": parse_seconds}
 _CHUNK_BYTES = 2**16
 _PLACE, _ACCURACIES = ("latitude", "longitude", "altitude"), ("horizontalAccuracy", "verticalAccuracy")
@@ -71,10 +70,10 @@ def local_frame(file: SensorFile) -> LocalFrame:
 
 def _table(name: str, sensor: Configured, file: SensorFile, problems: Problems) -> Iterator[Reading]:
     sigmas = tuple(dict.fromkeys(sensor.sigma_columns))
-    header = _header(file.path)
-    has_sigmas = bool(sigmas) and set(sigmas) <= set(header)
+    there = _header(file.path)
+    has_sigmas = bool(sigmas) and set(sigmas) <= set(there)
     asked = sensor.columns + (sigmas if has_sigmas else ())
-    for t_ns, numbers in read_rows(file.path, _row(asked, header, file.path), problems, ",", needs_line_end=True):
+    for t_ns, numbers in read_rows(file.path, _row(asked, there, file.path), problems, ",", needs_line_end=True):
         values = np.array(numbers[: len(sensor.columns)])
         if not has_sigmas:
             yield Reading(name, t_ns, values)
@@ -125,16 +124,7 @@ def _row(asked: tuple[str, ...], header: tuple[str, ...], path: Path) -> Callabl
 
 def _header(path: Path, of: Collection[str] = tuple(_STAMPS)) -> tuple[str, ...]:
     """Return the names of a table's columns, in a comment or not, with one `of` them; empty: it does not say."""
-    try:
-        with open_file(path) as file:
-            for _ in range(_HEADER_LINES):
-                line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace")
-                names = tuple(field.strip(' #\t\r\n"') for field in line.split(","))
-                if set(names) & set(of):
-                    return names
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    return ()
+    return header(path, ",", lambda names: bool(set(names) & set(of)))
 
 
 def _nmea(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
@@ -176,16 +166,16 @@ def _gpmf(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[R
 
 def _location(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
     """Yield the fixes of a phone's Location.csv (Sensor Logger); accuracies are radii of 68 %, negative: no fix."""
-    header = _header(file.path, _PLACE)
-    if missing := [name for name in ("time", *_PLACE, *_ACCURACIES) if name not in header]:
-        raise DataError(f"{file.path}: no column {missing[0]}; there are {', '.join(header)}; docs/sensors/gnss.md")
-    at = [header.index(name) for name in (*_PLACE, *_ACCURACIES)]
+    there = _header(file.path, _PLACE)
+    if missing := [name for name in ("time", *_PLACE, *_ACCURACIES) if name not in there]:
+        raise DataError(f"{file.path}: no column {missing[0]}; there are {', '.join(there)}; docs/sensors/gnss.md")
+    at = [there.index(name) for name in (*_PLACE, *_ACCURACIES)]
 
     def parse(fields: list[str]) -> Row[Fix]:
         if len(fields) <= max(at):
             raise ValueError
         latitude, longitude, height, radius, up = (float(fields[k]) for k in at)
-        t_ns, place = parse_ns(fields[header.index("time")]), Geodetic(latitude, longitude, height)
+        t_ns, place = parse_ns(fields[there.index("time")]), Geodetic(latitude, longitude, height)
         return t_ns, Fix(t_ns, place, "single" if radius > 0.0 and up > 0.0 else "none", radius / _RADIUS_68, up)
 
     for _t_ns, fix in read_rows(file.path, parse, problems, ",", needs_line_end=True):

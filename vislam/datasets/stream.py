@@ -30,6 +30,7 @@ from vislam.datasets.images import (
     probe,
 )
 from vislam.datasets.imu_pairs import ImuRows
+from vislam.datasets.imu_tables import check_names
 from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, RegisteringLoader, VideoLoader
 from vislam.datasets.tables import Row, in_time_order, read_numbers
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -141,7 +142,10 @@ class Survey:
             return self.streams.imu_rows(problems)
         if self.samples is not None:
             return self.samples.imu_rows(problems)
-        return iter(()) if self.imu_file is None else read_numbers(self.imu_file, 6, problems)
+        if self.imu_file is None:
+            return iter(())
+        check_names(self.imu_file)
+        return read_numbers(self.imu_file, 6, problems)
 
     def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
         """Yield stamp and field as recorded, as `imu_rows` does."""

@@ -16,6 +16,7 @@ from vislam.core.errors import DataError
 from vislam.core.reading import open_file
 from vislam.core.recording import Problems
 from vislam.core.streams import Happening, StreamJudge
+from vislam.trajectory.formats import is_number
 
 T = TypeVar("T")
 Row = tuple[int, T]  # stamp in ns, and what the row holds
@@ -23,6 +24,7 @@ Row = tuple[int, T]  # stamp in ns, and what the row holds
 MAX_LINE_BYTES = 4096  # the longest line of any supported table is far shorter; a longer one is not such a table
 MAX_FILE_BYTES = 2**30  # of tables that are indexed in memory: 4 days of images at 30 Hz
 _MAX_STAMP_NS = 2**62
+_HEADER_LINES = 20  # a header stands among the first ones
 _ENOUGH_ROWS = 20  # below this many rows, one bad line in two is not yet "mostly unusable"
 _MANY_ROWS = 1000  # bad rows, and more than good ones, settle it
 _NAMED_GAPS = 5  # of a stream, one by one
@@ -156,6 +158,27 @@ def read_frame_stamps(
 
     check_size(path, MAX_FILE_BYTES)
     return read_rows(path, parse, problems, ",", needs_line_end=True)
+
+
+def header(
+    path: Path, separator: str | None = ",", fits: Callable[[tuple[str, ...]], bool] | None = None
+) -> tuple[str, ...]:
+    """Return the names of a table's columns; empty where there is no such table, or none in its first lines.
+
+    Those of a line that `fits`; by default of one with four columns or more and without a number.
+    """
+    if not path.is_file():
+        return ()
+    try:
+        with open_file(path) as file:
+            for _ in range(_HEADER_LINES):
+                line = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").strip(" #\r\n")
+                names = tuple(name.strip(' #\t"') for name in line.split(separator))
+                if fits(names) if fits else len(names) >= 4 and not any(map(is_number, names)):
+                    return names
+    except OSError:  # which reading reports
+        return ()
+    return ()
 
 
 def check_size(path: Path, limit_bytes: int) -> None:

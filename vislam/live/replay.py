@@ -72,6 +72,10 @@ class ReplaySource:
         self._outages = outages or Outages()
         self._epoch = Epoch()
 
+    def wrapped(self) -> Recording:
+        """Return the recording that is played."""
+        return self._open()
+
     def check(self) -> None:
         """Do nothing: the recording is there."""
 

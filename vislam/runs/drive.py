@@ -323,7 +323,8 @@ class Run:
         counters: dict[str, Any] = {**front.counters, "localisation": dict(self.slam.counters)}
         if back is not None:
             counters |= back.counters
-        evidence, verdict = judged(self._evidence(front, final), self.config.verdict, self.recording)
+        gathered = self._evidence(front, final)
+        evidence, verdict = judged(gathered, self.config.verdict, self.recording, self.witness.seen)
         self.warnings += front.noise_warnings
         found = self._found_in_map()
         by_truth, not_compared = accuracy(self.log, final, truth, front.alignment, self._input.problems)

@@ -11,7 +11,7 @@ import numpy as np
 from vislam.config import Config, MachineConfig, VerdictConfig
 from vislam.core.errors import VislamError
 from vislam.core.memory import EdgeReport
-from vislam.core.messages import Array, GraphUpdate, KeyframePacket, LoopDecision, NavState, Tracking
+from vislam.core.messages import Array, GraphUpdate, ImageU8, KeyframePacket, LoopDecision, NavState, Tracking
 from vislam.core.recording import Recording
 from vislam.core.streams import Happening, StreamEvent
 from vislam.datasets.extrinsics import contradicted_extrinsics
@@ -37,6 +37,7 @@ _MIN_COMPARED = 10  # poses
 _AT_ONCE_NS = 200_000_000
 _OF_FRAMES = ("cam", "depth")  # begin the names of their streams: frames between are bridged by what was seen before
 _EXPLAINED = 0.5  # of the turns of what drives, by the gyroscope's: else they show nothing
+_MOST_SEEN = 11  # keyframes: half of them remain where one more comes
 _SAMPLES = 4  # of a span, at least, for a judgement
 _REFUSALS = ("gravity", "disagreement", "accel bias")  # of the start: sensors that contradict each other
 _VISION = (("vo_accepted", "vo_gated", "vo_opposed"), ("tracks_used", "tracks_gated"), ("points_used", "points_gated"))
@@ -172,7 +173,11 @@ def _calibration(learned: dict[str, float]) -> dict[str, Any]:
 
 
 class KeyframeWitness:
-    """Owns what keyframes bring that only a comparison of sensors asks for: turns by vision, inertial steps."""
+    """Owns what keyframes bring that only a comparison of sensors asks for: turns by vision, inertial steps, images.
+
+    Attributes:
+        is_hurried: whether the run has to end soon: what takes seconds is not asked then.
+    """
 
     def __init__(self, config: Config) -> None:
         """Start empty."""
@@ -181,10 +186,27 @@ class KeyframeWitness:
         self._inertial: dict[int, Preintegrated] = {}  # by the keyframe at their end
         self._rotation: Moved | None = None
         self._scale_sigma = 0.0
+        self._seen: list[tuple[ImageU8, ...]] = []
+        self._every, self._keyframes = 1, 0
+        self.is_hurried = False
+
+    @property
+    def seen(self) -> Sequence[tuple[ImageU8, ...]] | None:
+        """Images of some keyframes that several cameras saw, spread over the run; None: nothing is to be asked."""
+        return None if self.is_hurried else self._seen
+
+    def _look(self, images: tuple[ImageU8, ...]) -> None:
+        if len(images) > 1 and self._keyframes % self._every == 0:
+            self._seen.append(images)
+            if len(self._seen) > _MOST_SEEN:
+                del self._seen[1::2]
+                self._every *= 2
+        self._keyframes += 1
 
     def add(self, packet: KeyframePacket, update: GraphUpdate) -> None:
         """Take a keyframe and what the graph made of it."""
         span, vo = packet.imu, packet.vo
+        self._look(packet.keyframe.frame.images)
         if update.details is not None and update.newest is not None:
             self._scale_sigma = float(update.details.get("scale_sigma") or 0.0)
             self._rotation = _window_turn(update.details.get("calibration"), self._config.window.rotation_sigma_deg)
@@ -290,13 +312,16 @@ def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart
     return None
 
 
-def judged(evidence: Evidence, config: VerdictConfig, recording: Recording) -> tuple[Evidence, Verdict]:
+def judged(
+    evidence: Evidence, config: VerdictConfig, recording: Recording, seen: Sequence[tuple[ImageU8, ...]] | None
+) -> tuple[Evidence, Verdict]:
     """Return evidence and verdict; of a run that is not trusted with what contradicts its extrinsics.
 
-    They are the usual cause of a run that fails from its first frame on.
+    They are the usual cause of a run that fails from its first frame on. `seen` is as for `contradicted_extrinsics`;
+    with None nothing is asked.
     """
     verdict = judge(evidence, config)
-    if verdict.state is not Trust.TRUSTED:
-        evidence = replace(evidence, causes=contradicted_extrinsics(recording) + evidence.causes)
+    if verdict.state is not Trust.TRUSTED and seen is not None:
+        evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen) + evidence.causes)
         verdict = judge(evidence, config)
     return evidence, verdict

@@ -157,7 +157,8 @@ def _in_graph(came: dict[str, int], did: dict[str, int], since: int) -> dict[str
 def refuse(metrics: dict[str, Any], out: Path) -> None:
     """Raise DataError when a run had no frame, TrackingLostError when its verdict is that it is lost."""
     if metrics["frames"] == 0:
-        raise DataError(f"{metrics['name']}: not one usable frame; run `vislam doctor` on it")
+        why = max(metrics["problems"].items(), key=lambda item: item[1], default=("", 0))[0]
+        raise DataError(f"{metrics['name']}: not one usable frame{why and f': {why}'}; run `vislam doctor` on it")
     if metrics["verdict"]["state"] == Trust.LOST:
         why = "; ".join(metrics["verdict"]["reasons"][:3])  # a cause comes before what it leads to
         raise TrackingLostError(f"{metrics['name']}: {why}; see tracking.csv and report.html in {out}")

@@ -172,6 +172,15 @@ def stamp_ns(text: str, unit_ns: float, path: Path, line: int) -> int:
     return int((value * int(unit_ns)).to_integral_value())
 
 
+def is_number(text: str) -> bool:
+    """Return whether a field is a number; Python would read 1_0 as one."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return "_" not in text
+
+
 def why_columns(count: int) -> str:
     """Return in words what rows of `count` numbers are, for a reader that does not take them."""
     known = {

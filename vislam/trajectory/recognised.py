@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
@@ -20,12 +21,14 @@ from vislam.core.reading import open_file
 from vislam.core.trajectory import Trajectory
 from vislam.trajectory.formats import (
     data_lines,
+    is_number,
     kitti_poses,
     read_kitti_times,
     stamp_ns,
     trajectory_of_rows,
     why_columns,
 )
+from vislam.trajectory.named_columns import NamedColumns, named_columns, whole_names
 
 _OTHERS = {
     b"PK\x03\x04": "a zip archive, as evo saves results; unzip it and give the trajectory in it, if it holds one",
@@ -43,15 +46,6 @@ _UNITS = {1.0: "nanoseconds", 1e3: "microseconds", 1e6: "milliseconds", 1e9: "se
 _EPOCH = ((1e17, 1.0), (1e14, 1e3), (1e11, 1e6))  # stamps since 1970 from 1973 to 5138 show their unit
 _SINCE_1970_S = 1e8  # of a stamp, and more in smaller units
 _NS_STEP = 1e4  # poses are neither three hours apart nor 10 us
-_UNIT_NAMES = {"ns": 1.0, "nsec": 1.0, "nanosec": 1.0, "nanoseconds": 1.0, "us": 1e3, "usec": 1e3, "ms": 1e6}
-_UNIT_NAMES |= {"s": 1e9, "sec": 1e9, "secs": 1e9, "seconds": 1e9}
-_TIMES = {"t", "ts", "time", "timestamp", "timestamps", "stamp", "sec", "secs", "seconds", "utime"}
-_TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot", "ori", "o"}
-_PLACES = {"p", "pos", "position", "t", "translation", "trans", "location"}
-_RATES = {"v", "vel", "velocity", "twist", "linear", "angular", "b", "bias", "cov", "covariance", "sigma", "std", "acc"}
-_WHOLE = {"q": ["qx", "qy", "qz", "qw"], "p": ["px", "py", "pz"]}
-_DEGREES = {"lat", "latitude", "lon", "lng", "longitude"}
-_COUNTED = {"frame", "frames", "index", "idx", "id", "seq", "image", "keyframe", "kf"}
 _KITTI_HZ = 10
 
 
@@ -71,11 +65,11 @@ class _Layout:
     width: int  # fields of each line, without an empty last one
     stamp: int | None  # column
     position: tuple[int, ...] = ()  # columns of x y z
-    quaternion: tuple[int, ...] = ()  # columns of x y z w
+    turn: tuple[int, ...] = ()  # columns of a quaternion x y z w, or of roll pitch yaw
     matrix: int | None = None  # first of 12 columns
     unit_ns: float = 1e9
     header: bool = False  # whether the first line is names
-    nanos: int | None = None  # column of the nanoseconds behind whole seconds
+    named: NamedColumns | None = None  # where the header states the columns
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -114,10 +108,21 @@ def recognise(path: Path, times: Path | None = None, or_times: Path | None = Non
         poses = kitti_poses(numbers, path, lines)
         found = trajectory_of_rows(t_ns, poses, path, lines)
     else:
-        turns = numbers[:, 3:] if layout.quaternion else np.zeros((len(numbers), 4))
-        found = trajectory_of_rows(t_ns, (numbers[:, :3], turns), path, lines, identity_is_none=True)
+        found = trajectory_of_rows(t_ns, _pose_parts(layout, numbers), path, lines, identity_is_none=True)
     kind = f"{layout.name}, {_UNITS[layout.unit_ns]}" + ("" if found.has_rotation else ", positions only")
     return Recognised(found, f"{kind}; {len(found)} poses over {found.duration_s:.1f} s{left_out}")
+
+
+def _pose_parts(layout: _Layout, numbers: Array) -> tuple[Array, Array]:
+    """Return positions [N, 3] in metres and quaternions x y z w [N, 4], zero where none is stated."""
+    positions, turns = numbers[:, :3], numbers[:, 3:] if layout.turn else np.zeros((len(numbers), 4))
+    if layout.named is not None:
+        positions = positions * layout.named.unit_m
+    if len(layout.turn) == 3:
+        turns = Rotation.from_euler(
+            "ZYX", turns[:, ::-1], layout.named is not None and layout.named.in_degrees
+        ).as_quat()
+    return positions, turns
 
 
 def _times_of(path: Path) -> Path | None:
@@ -158,94 +163,26 @@ def _layout(path: Path) -> _Layout:
     separator = next((sign for sign in (",", ";") if sign in sample[0][1]), None)
     rows = [_fields(line, separator) for _, line in sample]
     headers = [_fields(text, separator) for text in reversed(comments)]
-    names = next((n for n in headers if len(n) == len(rows[0])), []) or _beginning(headers, len(rows[0]))
-    has_header = not any(_is_number(field) for field in rows[0])
+    width = len(rows[0])
+    names = next((whole for n in headers if (whole := whole_names(n, width))), [])
+    names = names or next((n for n in headers if len(n) == width), [])
+    has_header = not any(is_number(field) for field in rows[0])
     if has_header:
         names, rows = rows[0], rows[1:]
-    _refuse_names(path, names)
+    named = named_columns(path, names)
     if not rows:
         raise DataError(f"{path} holds names of columns, but no poses")
-    width = len(names if has_header else rows[0])
-    if (named := _by_names(names, separator, width, rows)) is not None:
-        stated, stamp, position, quaternion, unit_ns = named
-        nanos = _nanos_of(names, stamp)
-        unit_ns = unit_ns if nanos is None else 1e9
-        return _Layout(stated, separator, width, stamp, position, quaternion, None, unit_ns, has_header, nanos)
-    return _by_numbers(path, sample[has_header], separator, rows, has_header)
-
-
-def _beginning(headers: list[list[str]], width: int) -> list[str]:
-    """Return the names of the columns of a wider table, of which the first are a pose's; empty without any.
-
-    OpenVINS names its states so, and all columns of one quantity at once: timestamp(s) q p v bg ba.
-    """
-    for names in headers:
-        whole = [axis for name in names[:8] for axis in _WHOLE.get(name, [name])][:8]
-        if width > 8 and sorted(map(_role, whole)) == sorted(["t", "px", "py", "pz", "qx", "qy", "qz", "qw"]):
-            return whole + [""] * (width - 8)
-    return []
-
-
-def _refuse_names(path: Path, names: list[str]) -> None:
-    """Raise DataError for columns that are named, but hold neither metres nor times."""
-    if _DEGREES & {word for name in names for word in _words(name)}:
-        raise DataError(
-            f"{path} holds latitude and longitude ({', '.join(names)[:80]}), which are no metres; convert them to "
-            "east, north, up"
-        )
-    if names and not any(_role(name) == "t" for name in names) and _COUNTED & {*_words(names[0])}:
-        raise DataError(f"{path}: no column is a time, the first is '{names[0][:40]}'; put the time of each pose there")
-
-
-def _by_names(
-    names: list[str], separator: str | None, width: int, rows: list[list[str]]
-) -> tuple[str, int, tuple[int, ...], tuple[int, ...], float] | None:
-    """Return kind, columns and unit as a header names them; None where it does not name all that is needed."""
-    if len(names) != width:
-        return None
-    roles = [_role(name) for name in names]
-    position, quaternion = (
-        tuple(roles.index(kind + axis) for axis in axes if kind + axis in roles)
-        for kind, axes in (("p", "xyz"), ("q", "xyzw"))
-    )
-    stamps = [k for k, role in enumerate(roles) if role == "t"]
-    if not stamps or len(position) != 3 or len(quaternion) not in (0, 4):
-        return None
-    stamp = next((k for k in stamps if "stamp" in names[k].lower()), stamps[0])
-    unit = next((_UNIT_NAMES[word] for word in _words(names[stamp])[1:] if word in _UNIT_NAMES), None)
-    table = "TUM" if separator is None and width == 8 and quaternion == (4, 5, 6, 7) else "columns by their names"
-    if separator and (width, quaternion[3:]) in {(8, (4,)), (17, (4,))}:
-        table = "EuRoC"
-    return table, stamp, position, quaternion, _unit_ns(rows, stamp) if unit is None else unit
-
-
-def _nanos_of(names: list[str], stamp: int) -> int | None:
-    """Return the column of nanoseconds that belongs to one of whole seconds, as ROS's stamps are written apart."""
-    *before, last = _words(names[stamp])
-    pairs = {"sec": ("nanosec", "nsec"), "secs": ("nsecs",), "s": ("ns",)}
-    wanted = [[*before, other] for other in pairs.get(last, ())]
-    return next((k for k, name in enumerate(names) if _words(name) in wanted), None)
-
-
-def _role(name: str) -> str:
-    """Return "t", "px" to "pz", "qx" to "qw", or nothing, for what a column holds by its name."""
-    words = _words(re.sub(r"[\[(].*", "", name))
-    if not words:
-        return ""
-    *before, last = words
-    if "stamp" in words or (words[0] in _TIMES and last not in "xyz"):
-        return "t"
-    if _RATES & set(words):
-        return ""
-    if len(last) == 2 and last[1] in "xyzw" and last[0] in "ptqo":  # tx, qw
-        return ("q" if last[0] in "qo" else "p") + last[1]
-    if last == "w" or (last in "xyz" and _TURNS & set(before)):
-        return "q" + last
-    return "p" + last if last in ("x", "y", "z") and (not before or _PLACES & set(before)) else ""
-
-
-def _words(name: str) -> list[str]:
-    return re.findall(r"[a-z]+", name.lower())
+    if named is None:
+        return _by_numbers(path, sample[has_header], separator, rows, has_header)
+    what = "TUM" if separator is None and width == 8 and named.turn == (4, 5, 6, 7) else "columns by their names"
+    if separator and (width, named.turn[3:]) in {(8, (4,)), (17, (4,))}:
+        what = "EuRoC"
+    if len(named.turn) == 3:
+        what += f", roll pitch yaw in {'degrees' if named.in_degrees else 'radians'}"
+    if named.unit_m != 1.0:
+        what += f", positions times {named.unit_m:g}"
+    unit_ns = _unit_ns(rows, named.stamp) if named.unit_ns is None else named.unit_ns
+    return _Layout(what, separator, width, named.stamp, named.position, named.turn, None, unit_ns, has_header, named)
 
 
 def _by_numbers(
@@ -272,19 +209,20 @@ def _by_numbers(
         return _Layout(f"stamp and position {kind}", separator, width, 0, (1, 2, 3), (), None, unit_ns, header)
     if width == 7 and abs(first[0]) > _SINCE_1970_S and not _has_quaternion([["", *row] for row in rows]):
         why = (
-            "7 numbers whose last four are no quaternion; if they are t x y z and angles, write above: # t x y z r p y"
+            "7 numbers whose last four are no quaternion; if they are t x y z and angles, name them above: "
+            "# t x y z roll_deg pitch_deg yaw_deg"
         )
-        raise DataError(f"{path}:{line}: {why} to take the positions")
+        raise DataError(f"{path}:{line}: {why}, or _rad")
     if width < 8 or not _has_quaternion(rows):
         raise DataError(f"{path}:{line}: {why_columns(width)}")
     w_first = separator is not None and (unit_ns != 1e9 or width == 17 or abs(first[4]) > 0.99)
+    known = {8: "EuRoC", 17: "EuRoC", 11: "VINS-Mono or VINS-Fusion"}
     if separator is None:
         name = "TUM" if unit_ns == 1e9 else "TUM columns as of ORB-SLAM3"
     else:
-        known = {8: "EuRoC", 17: "EuRoC", 11: "VINS-Mono or VINS-Fusion"}
         name = known.get(width, f"a table {kind}") if w_first else f"TUM columns {kind}"
     name += ", quaternion w first" if w_first else ", quaternion w last"
-    if separator is None and width > 8:
+    if width > 8 and (separator is None or width not in known):
         name += f", {width - 8} further columns ignored"
     return _Layout(
         name, separator, width, 0, (1, 2, 3), (5, 6, 7, 4) if w_first else (4, 5, 6, 7), None, unit_ns, header
@@ -293,7 +231,7 @@ def _by_numbers(
 
 def _has_quaternion(rows: list[list[str]]) -> bool:
     """Return whether columns 5 to 8 of most rows have norm 1, or are zero or NaN as where no rotation is given."""
-    turns = np.array([[float(f) if _is_number(f) else np.inf for f in row[4:8]] for row in rows if len(row) >= 8])
+    turns = np.array([[float(f) if is_number(f) else np.inf for f in row[4:8]] for row in rows if len(row) >= 8])
     norms = np.linalg.norm(turns, axis=1)
     return bool(np.mean((np.abs(norms - 1.0) < 0.1) | (norms == 0.0) | np.isnan(norms)) > 0.5)
 
@@ -305,7 +243,7 @@ def _is_pose(twelve: Array) -> bool:
 
 def _unit_ns(rows: list[list[str]], column: int) -> float:
     """Return the unit of stamps by how large they are and how far apart."""
-    stamps = np.array([float(row[column]) for row in rows if len(row) > column and _is_number(row[column])])
+    stamps = np.array([float(row[column]) for row in rows if len(row) > column and is_number(row[column])])
     stamps = stamps[np.isfinite(stamps)]
     if not len(stamps):
         return 1e9
@@ -317,14 +255,6 @@ def _unit_ns(rows: list[list[str]], column: int) -> float:
     return 1.0 if len(steps) and np.median(steps) >= _NS_STEP else 1e9
 
 
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return "_" not in field
-
-
 def _fields(line: str, separator: str | None) -> list[str]:
     """Return the fields of a line, without an empty one behind the last separator."""
     fields = [field.strip(' \t"') for field in line.split(separator)]
@@ -333,7 +263,7 @@ def _fields(line: str, separator: str | None) -> list[str]:
 
 def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int, bool]:
     """Return stamps, the numbers of poses [N, 3, 7 or 12], lines [N], how many rows were NaN, if the last is cut."""
-    used: Sequence[int] = (*layout.position, *layout.quaternion)
+    used: Sequence[int] = (*layout.position, *layout.turn)
     if layout.matrix is not None:
         used = range(layout.matrix, layout.matrix + 12)
     stamps: list[str] = []
@@ -360,12 +290,12 @@ def _rows(path: Path, layout: _Layout) -> tuple[list[str], Array, list[int], int
         except ValueError as error:
             raise DataError(f"{path}:{number}: {error}") from error
         stamps.append("" if layout.stamp is None else fields[layout.stamp])
-        if layout.nanos is not None:
-            stamps[-1] += f".{fields[layout.nanos]:0>9}"
+        if layout.named is not None and layout.named.nanos is not None:
+            stamps[-1] += f".{fields[layout.named.nanos]:0>9}"
         lines.append(number)
     numbers = np.array(rows).reshape(-1, len(used))
     kept = ~np.isnan(numbers).all(axis=1) if layout.stamp is not None else np.ones(len(numbers), dtype=bool)
-    if layout.quaternion and np.isnan(numbers[:, 3:]).all():
+    if layout.turn and np.isnan(numbers[:, 3:]).all():
         numbers[:, 3:] = 0.0
     index = np.flatnonzero(kept)
     stamps, lines, numbers = [stamps[k] for k in index], [lines[k] for k in index], numbers[kept]

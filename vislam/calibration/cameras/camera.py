@@ -24,7 +24,8 @@ from vislam.core.camera import CameraSigmas
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.datasets.calibration_text import camera_text
-from vislam.datasets.camera_files import CameraCalibration, camchain_text, camera_info_text
+from vislam.datasets.camera_files import camchain_text, camera_info_text
+from vislam.datasets.foreign_cameras import CameraCalibration
 
 _FILES = ("camchain.yaml", "camera.yaml", "camera_info.yaml", "camera.png", "camera.json")
 _MIN_VIEWS = 6

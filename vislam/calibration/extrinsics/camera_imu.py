@@ -16,7 +16,8 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_log, transform
 from vislam.core.messages import Array, Frame, ImuSample
 from vislam.core.recording import Recording, with_camera
-from vislam.datasets.camera_files import CameraCalibration, camchain_text
+from vislam.datasets.camera_files import camchain_text
+from vislam.datasets.foreign_cameras import CameraCalibration
 from vislam.runs.sources import open_source
 
 _FILES = ("camera-imu.yaml", "camera-imu.png", "camera-imu.json")

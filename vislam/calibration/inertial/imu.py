@@ -22,7 +22,7 @@ from vislam.calibration.options import ImuOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.imu_files import imu_calibration_text
+from vislam.datasets.imu_files import calibration_text
 from vislam.imu import ImuCalibration
 
 _FILES = ("imu.yaml", "imu.png", "imu.json")
@@ -63,7 +63,7 @@ def calibrate_imu(options: ImuOptions) -> Outcome:
     moved = movement(table, _QUIET_SHARE)
     result = solve_imu(table, moved, options)
     report = _report(result, table)
-    path = folder.write_text("imu.yaml", imu_calibration_text(result.calibration, _comment(result)))
+    path = folder.write_text("imu.yaml", calibration_text(result.calibration, _comment(result)))
     folder.write_picture("imu.png", (11.0, 7.0), lambda figure, colors: draw(figure, colors, result, table, moved))
     folder.write_report("imu.json", report)
     lines = (*_lines(result), f"next: vislam run ... --calibration.imu {path}, for recordings of raw samples")

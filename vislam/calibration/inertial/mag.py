@@ -17,7 +17,7 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import level_rotation
 from vislam.core.messages import Array
 from vislam.datasets import survey
-from vislam.datasets.imu_files import mag_calibration_text, read_imu_calibration
+from vislam.datasets.imu_files import calibration_text, read_imu_calibration
 from vislam.imu import MagCalibration
 
 _FILES = ("mag.yaml", "mag.png", "mag.json")
@@ -61,7 +61,7 @@ def calibrate_mag(options: MagOptions) -> Outcome:
     folder = Folder(options.out, _FILES, options.overwrite)
     result = solve_mag(read_field(options.source), _inertial(options), options)
     report = _report(result)
-    path = folder.write_text("mag.yaml", mag_calibration_text(result.calibration, "; ".join(_statements(result))))
+    path = folder.write_text("mag.yaml", calibration_text(result.calibration, "; ".join(_statements(result))))
     folder.write_picture("mag.png", (9.0, 4.4), lambda figure, colors: draw(figure, colors, result))
     folder.write_report("mag.json", report)
     lines = (*_lines(result), f"next: vislam run ... --calibration.mag {path}, for recordings of raw fields")

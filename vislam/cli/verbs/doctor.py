@@ -132,7 +132,7 @@ def _print_inspection(inspection: Inspection) -> None:
     size = f"{inspection.duration_s:.1f} s, {inspection.size_bytes / 1e6:.1f} MB"
     Console().print(f"{printable(inspection.source)}: {inspection.format}, {size}", soft_wrap=True)
     topics = [
-        (t.name, t.type.replace("/msg/", "/"), str(t.count), f"{t.rate_hz:.1f}".strip("na"), t.taken_for)
+        (t.name, t.type.replace("/msg/", "/"), str(t.count), number(t.rate_hz, 1).replace("nan", ""), t.taken_for)
         for t in inspection.topics
     ]
     if topics:

@@ -21,7 +21,7 @@ from vislam.datasets.calibration import CAMERA_EXAMPLE, DEPTH_UNITS_PER_M, Camer
 from vislam.datasets.camera_files import read_cameras
 from vislam.datasets.formats.truth import Truth, asl_truth
 from vislam.datasets.images import DepthFormat, ImageList
-from vislam.datasets.imu_files import imu_calibration, mag_calibration, read_noise
+from vislam.datasets.imu_files import calibration_in, read_noise
 from vislam.datasets.imu_tables import Pair, pair_in
 from vislam.datasets.stream import Survey, image_list, with_depth_format
 from vislam.datasets.tables import read_names
@@ -101,7 +101,7 @@ def _imu(
     try:
         if sensor.is_file():
             noise, T_body_imu = files.read_imu(sensor)
-            return data, noise, T_body_imu, imu_calibration(files.load_yaml(sensor), sensor)
+            return data, noise, T_body_imu, calibration_in(files.load_yaml(sensor), sensor, ImuCalibration)
         kalibr = _kalibr(root, "imu_config.yaml")
         if kalibr is None:
             raise DataError(f"{sensor} is missing; write the IMU's noise into it, see docs/formats.md")
@@ -181,8 +181,9 @@ def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path |
     T_body_mag, calibration = T_body_imu, None
     try:
         if sensor.is_file():
-            keys = files.load_yaml(sensor)
-            T_body_mag, calibration = files.read_pose(keys, sensor), mag_calibration(keys, sensor)
+            keys = files.Keys(files.load_yaml(sensor))
+            T_body_mag, calibration = files.read_pose(keys, sensor), calibration_in(keys, sensor, MagCalibration)
+            keys.name_unused(sensor, "T_BS")
     except DataError as error:
         errors.append(error)
         return None, np.eye(3), None
@@ -195,7 +196,9 @@ def _truth(root: Path, T_body_imu: Array, errors: list[DataError]) -> Truth | No
         data, sensor = root / name / "data.csv", root / name / "sensor.yaml"
         if data.is_file():
             try:
-                T_body_sensor = files.read_pose(files.load_yaml(sensor), sensor) if sensor.is_file() else T_body_imu
+                keys = files.Keys(files.load_yaml(sensor) if sensor.is_file() else {})
+                T_body_sensor = files.read_pose(keys, sensor) if keys else T_body_imu
+                keys.name_unused(sensor, "T_BS")
             except DataError as error:
                 errors.append(error)
                 return None

@@ -24,24 +24,22 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
-from vislam.core.reading import open_file, read_text
+from vislam.core.reading import read_text
 from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
-from vislam.datasets.images import ImageList, check_size_px
+from vislam.datasets.images import ImageList
 from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.imu_tables import (
     STANDARD_GRAVITY_M_S2,
     Pair,
     Table,
-    Whole,
-    header,
     holds_pair,
-    is_number,
     pair_in,
 )
-from vislam.datasets.loaders import video_facts
+from vislam.datasets.loaders import check_film
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import MAX_LINE_BYTES, Row, parse_ns, parse_seconds, read_frame_stamps
+from vislam.datasets.tables import Row, header, parse_ns, parse_seconds, read_frame_stamps
+from vislam.trajectory.formats import is_number
 
 LOOKS_FOR = (
     "Gyroscope.csv of Sensor Logger, gyro_accel.csv of the MARS logger, gyro.csv, accelerometer.csv and frames.mov, or "
@@ -85,11 +83,7 @@ def survey(path: Path) -> Survey:
         images, video = _frames(path, logger, problems)
         cameras = (images,)
         if video is not None:
-            size, frames = video_facts(video)
-            last = int(images.files[-1]) + 1 if images.files else 0
-            problems.count("video frame without a stamp", times=max(0, frames - last) if frames > 0 else 0)
-            if rig is not None:
-                check_size_px(size, rig.cameras[0], video)
+            check_film(video, images, rig, problems)
     except DataError as error:
         errors.append(error)
     return Survey(
@@ -132,7 +126,7 @@ def _samples(path: Path, logger: Logger | None) -> tuple[ImuRows, list[Finding]]
         columns = tuple(names.index(name) for name in (*_RATES, *_FORCES))
         parse = _stamp_parser(names[0], table)
         what = "MARS logger: forces were interpolated at the stamps of the rates by the app"
-        return Whole(Table(table, columns, 0, parse)), [Finding("ok", what, path.name)]
+        return Table(table, columns, 0, parse), [Finding("ok", what, path.name)]
     if logger == "two tables" and (found := pair_in(path)) is not None:
         return found[0], [found[1]]
     return _of_advio(path)
@@ -231,8 +225,8 @@ def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[Imag
         )
         named = [path / name for name in ("frame_timestamps.txt", "movie_metadata.csv")]
         stamps = next((file for file in named if file.is_file()), named[0])
-        first = _first_name(_asked(stamps, "copy it from the phone"))
-        parse = _stamp_parser(first, stamps) if first else parse_ns
+        names = header(_asked(stamps, "copy it from the phone"), fits=lambda names: not is_number(names[0]))
+        parse = _stamp_parser(names[0], stamps) if names else parse_ns
     _asked(video, "copy it from the phone")
     return image_list(
         "cam0",
@@ -244,16 +238,6 @@ def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[Imag
 
 def _films(path: Path) -> list[Path]:
     return sorted(file for file in path.iterdir() if file.suffix.lower() in (".mp4", ".mov"))
-
-
-def _first_name(path: Path) -> str:
-    """Return the name of the first column of a table, empty where it has no header."""
-    try:
-        with open_file(path) as file:
-            first = file.readline(MAX_LINE_BYTES).decode("utf-8-sig", errors="replace").split(",")[0].strip(" #\r\n")
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    return "" if is_number(first) else first
 
 
 def _sensor_logger_frames(path: Path, problems: Problems) -> tuple[ImageList, Path | None]:

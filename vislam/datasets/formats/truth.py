@@ -11,13 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from vislam.core.errors import DataError
 from vislam.core.geometry import rotation_from_quaternion_xyzw
 from vislam.core.messages import Array
 from vislam.core.recording import Problems
 from vislam.datasets.images import Stamps
-from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, in_time_order, parse_seconds, read_numbers
+from vislam.datasets.tables import MAX_FILE_BYTES, Row, check_size, header, in_time_order, parse_seconds, read_numbers
 from vislam.trajectory import Trajectory, read_kitti
 from vislam.trajectory.formats import gives_rotation
+from vislam.trajectory.named_columns import named_columns
 
 Truth = Callable[[Problems], Trajectory | None]
 
@@ -27,6 +29,7 @@ def asl_truth(path: Path, T_sensor_body: Array) -> Truth:
 
     def read(problems: Problems) -> Trajectory | None:
         check_size(path, MAX_FILE_BYTES)
+        _check_names(path, ",", (5, 6, 7, 4), 1.0)
         rows = ((t, [*v[:3], *v[4:7], v[3]]) for t, v in read_numbers(path, 7, problems))
         return trajectory_of(rows, problems, T_sensor_body)
 
@@ -38,9 +41,19 @@ def tum_truth(path: Path) -> Truth:
 
     def read(problems: Problems) -> Trajectory | None:
         check_size(path, MAX_FILE_BYTES)
+        _check_names(path, None, (4, 5, 6, 7), 1e9)
         return trajectory_of(read_numbers(path, 7, problems, parse_seconds, None), problems, np.eye(4))
 
     return read
+
+
+def _check_names(path: Path, separator: str | None, turn: tuple[int, ...], unit_ns: float) -> None:
+    """Raise DataError where a header names another order or unit than the format has."""
+    named = named_columns(path, [*header(path, separator)])
+    wanted = ((1, 2, 3), turn, unit_ns, 1.0)
+    if named and (named.position, named.turn or turn, named.unit_ns or unit_ns, named.unit_m) != wanted:
+        order = "qw, qx, qy, qz in ns" if turn[0] == 5 else "qx, qy, qz, qw in s"
+        raise DataError(f"{path}: its header names another order or unit than t, x, y, z, {order} and m; convert it")
 
 
 def kitti_truth(path: Path, t_ns: Stamps) -> Truth:

@@ -25,10 +25,10 @@ from vislam.core.findings import Finding
 from vislam.core.geometry import invert
 from vislam.core.recording import Problems
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
-from vislam.datasets.images import ImageList, check_size_px
+from vislam.datasets.images import ImageList
 from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.imu_tables import Pair, pair_in
-from vislam.datasets.loaders import video_facts
+from vislam.datasets.loaders import check_film
 from vislam.datasets.stream import Survey, image_list
 from vislam.datasets.tables import Row, read_frame_stamps
 from vislam.datasets.telemetry import (
@@ -100,12 +100,7 @@ def _survey(path: Path, joined: bool) -> Survey:
         film = joined_film(path) if joined and is_mp4(path) and later_chapters(path) != ([], "") else None
         own_clock = path.with_suffix(".imu.csv").is_file() or isinstance(samples, Pair)
         cameras = (_frames(path, problems, own_clock) if film is None else _of_film(film, path, problems),)
-        size, frames = video_facts(path)
-        if frames > 0 and (film is None or len(film.chapters) == 1):  # some containers do not know
-            last = int(cameras[0].files[-1]) + 1 if cameras[0].files else 0
-            problems.count("video frame without a stamp", times=max(0, frames - last))
-        if rig is not None:
-            check_size_px(size, rig.cameras[0], path)
+        check_film(path, cameras[0], rig, problems)
     except DataError as error:
         errors.append(error)
     return Survey(
