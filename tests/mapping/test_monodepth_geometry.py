@@ -6,9 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from vislam.core.geometry import so3_exp
-from vislam.mapping.depth.mono.fusion import fuse_beta, fuse_gaussian
 from vislam.mapping.depth.mono.stage import triangulated
-from vislam.mapping.depth.mono.triangulation import inverse_depth, inverse_depth_sigma
+from vislam.mapping.depth.mono.update import fuse_beta, fuse_gaussian, inverse_depth, inverse_depth_sigma
 
 PIXEL = 1.0 / 480.0
 small = st.floats(-0.4, 0.4)

@@ -9,16 +9,80 @@ import numpy as np
 
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageF32, ImageU8
-from vislam.mapping.depth.mono.fusion import fuse_beta, fuse_gaussian
 from vislam.mapping.depth.mono.matching import HALF, MARGIN, PIXELS, SIDE, load_patch, load_warped, score_at
-from vislam.mapping.depth.mono.triangulation import Vector, inverse_depth_sigma
 
+_SQRT_2_PI = math.sqrt(2.0 * math.pi)
+
+
+Vector = tuple[float, float, float]
 SEARCHED, CONVERGED, FAILED, FLAT = range(4)  # what became of a pixel; only the searched ones cost time
 NO_MATCH, MATCH, UNCHANGED = range(3)  # of one pixel in one frame; unchanged: out of view, or nothing to be learned
 _NEAREST_Z = 0.05  # of a point's z in the other camera over that in the reference: nearer is behind or beside it
 _NO_WARP = (1.0, 0.0, 0.0, 1.0)
 _SMALLEST_WARP = 1e-6  # of a square of the reference that is seen in the image
 _PEAK_PX = 3.0  # a second maximum of the score nearer than this belongs to the first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fuse_gaussian(rho: float, variance: float, measured: float, measured_variance: float) -> tuple[float, float]:
+    """Return mean and variance of the product of two normal distributions."""
+    total = variance + measured_variance
+    return (measured_variance * rho + variance * measured) / total, variance * measured_variance / total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fuse_beta(
+    rho: float, variance: float, a: float, b: float, measured: float, measured_variance: float, spread: float
+) -> tuple[float, float, float, float]:
+    """Return mean, variance, and the Beta parameters of the share of good measurements.
+
+    A measurement is either normal around the truth or uniform over `spread`, the whole range of inverse depth; the
+    posterior is fitted by its moments (Vogiatzis and Hernandez, "Video-based, real-time multi-view stereo", IVC 2011,
+    equations 19 to 28; also in SVO and REMODE).
+    """
+    total = variance + measured_variance
+    off = measured - rho
+    mean, fused = fuse_gaussian(rho, variance, measured, measured_variance)
+    good = a / (a + b) * math.exp(-0.5 * off * off / total) / (_SQRT_2_PI * math.sqrt(total))
+    bad = b / (a + b) / spread
+    good, bad = good / (good + bad), bad / (good + bad)
+    n = a + b
+    first = good * (a + 1.0) / (n + 1.0) + bad * a / (n + 1.0)
+    second = (good * (a + 1.0) * (a + 2.0) + bad * a * (a + 1.0)) / ((n + 1.0) * (n + 2.0))
+    new = good * mean + bad * rho
+    # moments about the new mean: no difference of large numbers
+    new_variance = good * (fused + (mean - new) ** 2) + bad * (variance + (rho - new) ** 2)
+    new_a = (second - first) / (first - second / first)
+    return new, new_variance, new_a, new_a * (1.0 - first) / first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def inverse_depth(q: Vector, t: Vector, u: float, v: float, du: float, dv: float) -> float:
+    """Return the inverse z-depth in the reference camera of a match at (u, v), in normalised coordinates of the other.
+
+    A point on the ray of reference pixel x at inverse z-depth rho lies, up to scale, at q + rho t in the other camera,
+    with q = R_cur_ref K^-1 x and t = t_cur_ref. All rays are in one frame before they are compared; the code published
+    with the slambook leaves the ray of the shifted pixel in the other camera's, and stops converging when it turns.
+
+    `(du, dv)` is the direction of the epipolar line there: the match is taken at its place along the line. Not finite
+    where the line shrinks to a point.
+    """
+    return (du * (u * q[2] - q[0]) + dv * (v * q[2] - q[1])) / (du * (t[0] - u * t[2]) + dv * (t[1] - v * t[2]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def inverse_depth_sigma(
+    q: Vector, t: Vector, u: float, v: float, du: float, dv: float, sigma: float
+) -> tuple[float, float]:
+    """Return the inverse depth of a match and its standard deviation.
+
+    The match may be off by `sigma` pixels along the epipolar line; `(du, dv)` is one pixel along it in normalised
+    coordinates. As in the slambook, the match is shifted by that and triangulated again: there with angles and the law
+    of sines, which is the same triangle.
+    """
+    rho = inverse_depth(q, t, u, v, du, dv)
+    shifted = inverse_depth(q, t, u + sigma * du, v + sigma * dv, du, dv)
+    return rho, abs(shifted - rho)
 
 
 class Belief(NamedTuple):
