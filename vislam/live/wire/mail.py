@@ -25,13 +25,7 @@ class Outbox:
 
     def put(self, value: object, timeout_s: float = 0.0) -> bool:
         """Put something in; False when it is full for so long."""
-        if self.is_broken:
-            return True
-        try:
-            self._waiting.put((time.monotonic_ns(), value), block=timeout_s > 0.0, timeout=timeout_s or None)
-        except queue.Full:
-            return False
-        return True
+        return self.is_broken or self._puts(value, timeout_s)
 
     def __len__(self) -> int:
         """Return how much waits."""
@@ -44,11 +38,18 @@ class Outbox:
         return 0.0 if since_ns is None else (time.monotonic_ns() - since_ns) * 1e-9
 
     def close(self) -> None:
-        """Send all that waits, then end the stream."""
-        while not self.put(_End(), 0.1):
+        """Send all that waits, then end the stream; where the other side is gone, at once."""
+        while not self._puts(_End(), 0.1):
             continue
         self._thread.join()
         self._connection.close()
+
+    def _puts(self, value: object, timeout_s: float) -> bool:
+        try:
+            self._waiting.put((time.monotonic_ns(), value), block=timeout_s > 0.0, timeout=timeout_s or None)
+        except queue.Full:
+            return False
+        return True
 
     def _send(self) -> None:
         while not isinstance((stamped := self._waiting.get())[1], _End):
