@@ -305,7 +305,7 @@ def test_idle_connections_lock_nobody_out(site: Site) -> None:
     idle = [socket.create_connection(("127.0.0.1", site.port)) for _ in range(_MOST + 8)]
     own: list[http.client.HTTPConnection] = []
     try:
-        own += all_places(site)
+        wait_for(lambda: bool(own.extend(all_places(site)) or own))
         assert len(own) == _MOST  # the user's own have taken the places of those that show no token
         for connection in own:  # and keep them
             connection.request("GET", "/state", headers={"Authorization": f"Bearer {_TOKEN}"})
