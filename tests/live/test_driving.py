@@ -11,12 +11,13 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.config import load
+from vislam.core.angles import wrapped
 from vislam.core.errors import DataError, UsageError
 from vislam.hw.health import Health
 from vislam.live.driving.driver import Driver
 from vislam.live.driving.lock_step import LockStepCart, drive
 from vislam.live.driving.orders import Goal
-from vislam.live.driving.pursuit import Limits, PathFollower, wrapped
+from vislam.live.driving.pursuit import Limits, PathFollower
 from vislam.live.driving.steering import grid_of
 from vislam.live.notices import MapCells
 from vislam.live.virtual.motion import Drive, Segment, locate

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vislam.core.angles import wrapped
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
@@ -22,7 +23,7 @@ from vislam.sensors.kinds import (
     Position,
     PositionSettings,
 )
-from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD, wrapped
+from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD
 from vislam.sensors.simulated import Faults, drawn_readings
 
 SEEDS = range(20)

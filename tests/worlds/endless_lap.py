@@ -24,8 +24,6 @@ from worlds.lap import EUROC_NOISE, LAP_S, T_BODY_CAM0, position, rotation
 from worlds.parts import EUROC_CAMERA, along_x, bare_keyframe, derivative, ideal_imu, on_walls, rig_of
 
 Array = NDArray[np.float64]
-Path = Callable[[Array], Array]
-Turn = Callable[[Array], Rotation]
 
 _IMU_HZ = 200
 STEREO = rig_of("stereo", EUROC_CAMERA, T_BODY_CAM0, along_x(0.11))
@@ -51,7 +49,7 @@ class LapWorld:
         tracks: int = 80,
         loop_every: int = 10,
         noise: ImuNoise = EUROC_NOISE,
-        motion: tuple[Path, Turn, float] = (position, rotation, LAP_S),
+        motion: tuple[Callable[[Array], Array], Callable[[Array], Rotation], float] = (position, rotation, LAP_S),
     ) -> None:
         """Prepare one lap; a lap must hold a whole number of keyframes. `tracks` 0: no observations.
 

@@ -1,8 +1,15 @@
 """Angles, exact near zero and near half a turn, where the arc cosine loses half of the digits, and directions."""
 
+import math
+
 import numpy as np
 
 from vislam.core.messages import Array
+
+
+def wrapped(angle_rad: float) -> float:
+    """Return an angle in (-pi, pi]."""
+    return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)
 
 
 def angles_between(a: Array, b: Array) -> Array:

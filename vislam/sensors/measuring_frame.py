@@ -94,11 +94,6 @@ def is_heading_known(variables: Sequence[Variable], sigmas: Array) -> bool:
     return all(s <= ENOUGH_YAW_RAD for v, s in zip(variables, sigmas, strict=True) if v.name == "yaw_rad")
 
 
-def wrapped(angle_rad: float) -> float:
-    """Return an angle in (-pi, pi]."""
-    return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)
-
-
 def thinned(items: Sequence[_T]) -> list[_T]:
     """Return at most `MOST_READINGS` of them, evenly spread, the first and the last among them."""
     if len(items) <= MOST_READINGS:

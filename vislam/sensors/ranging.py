@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vislam.core.angles import wrapped
 from vislam.core.messages import Array
-from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD, about_up, wrapped
+from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD, about_up
 from vislam.sensors.sensor import Begun
 
 _HEADINGS = 8  # to start from; a start within 45 deg of the truth ends there

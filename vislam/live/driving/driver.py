@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vislam.core.angles import wrapped
 from vislam.core.messages import Array
 from vislam.hw.health import Health
 from vislam.live.driving.orders import Goal
-from vislam.live.driving.pursuit import Docking, Limits, PathFollower, wrapped
+from vislam.live.driving.pursuit import Docking, Limits, PathFollower
 from vislam.live.wire.published_pose import PublishedPose
 from vislam.mapping.drive.drive_grid import Drive, DriveGrid
 from vislam.mapping.drive.route import ground, plan

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.angles import wrapped
 from vislam.core.messages import Array
 
 _AHEAD_M = 0.45  # of the cart is the point that it steers for
@@ -125,8 +126,3 @@ def turn(off_rad: float, limits: Limits) -> float:
     """Return the rate by which to turn on the spot by an angle."""
     braking = math.sqrt(2.0 * limits.angular_accel_rad_s2 * abs(off_rad))
     return math.copysign(min(_TURN_GAIN_HZ * abs(off_rad), braking, limits.rate_rad_s), off_rad)
-
-
-def wrapped(angle_rad: float) -> float:
-    """Return an angle within half a turn to both sides."""
-    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi

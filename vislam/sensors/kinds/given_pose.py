@@ -8,6 +8,7 @@ import numpy as np
 
 from vislam.config.ranges import Finite, NonNegative, Positive
 from vislam.config.sensors import Vector3
+from vislam.core.angles import wrapped
 from vislam.core.errors import UsageError
 from vislam.core.geometry import (
     quaternion_xyzw_from_rotation,
@@ -30,7 +31,6 @@ from vislam.sensors.measuring_frame import (
     lever_point,
     placed,
     thinned_pairs,
-    wrapped,
 )
 from vislam.sensors.sensor import Begun, Variable
 

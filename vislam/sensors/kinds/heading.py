@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.config.ranges import Finite, NonNegative, Positive
+from vislam.core.angles import wrapped
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured, noisy
-from vislam.sensors.measuring_frame import wrapped
 from vislam.sensors.sensor import Variable
 
 _UPRIGHT = 0.1  # cosine of the x axis's slope (84 deg) below which the body has no heading
