@@ -292,8 +292,14 @@ def test_what_explains_a_pair_that_does_not_fit_is_tried() -> None:
         assert ("or swap their images (" in found.next_step) == ("pose in cam0" in step)
         assert step or re.search(r"9\d % of (\d+) matches", found.what)
     unlike = replace(CAMERA, cx=CAMERA.cx + 12.0)  # only the cables then explain it
-    (found,) = judged_cameras(Rig((CAMERA, unlike), (T0, T0 @ T01)), [(np.roll(right, 12, axis=1), left)])
-    assert found.next_step.startswith("swap their images (")
+    rig, shown = Rig((CAMERA, unlike), (T0, T0 @ T01)), (left, np.roll(right, 12, axis=1))
+    swapped = shown[::-1]
+    for pairs, step in (
+        ([swapped], "swap their images ("),
+        ([shown, swapped, swapped], "swap their images in 2 of 3 "),
+    ):
+        (found,) = judged_cameras(rig, pairs)
+        assert found.next_step.startswith(step) and found.severity == "error"
 
 
 def test_a_run_asks_what_it_saw_and_recordings_within_others(tmp_path: Path) -> None:

@@ -59,11 +59,15 @@ def _judged_pair(rig: Rig, pairs: Sequence[tuple[ImageU8, ImageU8]]) -> Finding:
 def _tried(rig: Rig, pairs: Sequence[tuple[ImageU8, ImageU8]]) -> str:
     """Return which of the usual mistakes would explain that a pair does not fit, as what to do then."""
     cameras, (T0, T1) = rig.cameras[:2], rig.T_body_cams[:2]
+    exchanged = Rig(cameras[::-1], (T1, T0))
     tries = (
         ("write the inverse of both T_BS", Rig(cameras, (invert(T0), invert(T1)))),
         ("write the inverse of cam1's pose in cam0", Rig(cameras, (T0, T0 @ invert(rig.T_cam0_cam1)))),
-        ("swap their images", Rig(cameras[::-1], (T1, T0))),
+        ("swap their images", exchanged),
     )
+    if any(epipolar_facts(rig, [pair]).fits for pair in pairs):
+        count = sum(epipolar_facts(exchanged, [pair]).fits for pair in pairs)
+        return f"swap their images in {count} of {len(pairs)} frames looked at" if count else ""
     found = ((step, epipolar_facts(tried, pairs)) for step, tried in tries)
     return ", or ".join(f"{step} ({100 * facts.on_line:.0f} % fit then)" for step, facts in found if facts.fits)
 
