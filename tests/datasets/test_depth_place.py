@@ -11,10 +11,12 @@ import pytest
 
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_exp, se3_log
-from vislam.datasets import survey
+from vislam.datasets import open_dataset, survey
 from vislam.datasets.calibration_text import camera_text, depth_keys_text
+from vislam.datasets.extrinsics import misplaced_depth
 from vislam.datasets.images import DepthFormat
-from vislam.datasets.rgbd import fit_place
+from vislam.datasets.inspect import inspect
+from vislam.datasets.rgbd import PlaceFit, fit_place, misplaced
 from vislam.datasets.stream import with_depth_format
 from vislam.vision.depth_registration import DepthCamera
 
@@ -60,18 +62,36 @@ def write_scene(folder: Path, frames: int) -> Path:
     return folder
 
 
-def test_all_is_found_together_from_a_start_that_is_off(tmp_path: Path) -> None:
-    found = survey(f"tum:{write_scene(tmp_path / 'drawn', 40)}")
-    start = replace(TRUTH, time_offset_s=0.0, own=DepthCamera(LENS.with_focal(1.03), np.eye(4)))
-    fit = fit_place(with_depth_format(found, start), found.rig)
+def check(fit: PlaceFit | None, most_turn_deg: float, most_m: float) -> None:
     assert fit is not None and fit.how.own is not None
     turn_rad = se3_log(fit.how.own.T_color_depth @ invert(PLACE))[:3]
     off_m = (fit.how.own.T_color_depth - PLACE)[:3, 3]
-    assert np.rad2deg(np.abs(turn_rad)).max() < 0.15 and np.abs(off_m).max() < 0.003
+    assert np.rad2deg(np.abs(turn_rad)).max() < most_turn_deg and np.abs(off_m).max() < most_m
     assert abs(fit.how.own.camera.fx / LENS.fx - 1.0) < 0.005
     assert abs(fit.how.time_offset_s - TRUTH.time_offset_s) < 0.004
-    assert (np.abs(off_m) < 3.0 * fit.place_sigma_m).all() and (np.abs(turn_rad) < 3.0 * fit.turn_sigma_rad).all()
+    assert (np.abs(off_m) < 3.0 * fit.place_sigma_m).all()
     assert fit.turn_sigma_rad.max() < 0.003 and fit.place_sigma_m.max() < 0.005 and fit.lag_sigma_s < 0.004
+
+
+def test_all_is_found_together_from_starts_that_are_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = survey(f"tum:{write_scene(tmp_path / 'drawn', 40)}")
+    assert found.rig is not None
+    start = replace(TRUTH, time_offset_s=0.0, own=DepthCamera(LENS.with_focal(1.03), np.eye(4)))
+    fit = fit_place(with_depth_format(found, start), found.rig)
+    check(fit, 0.15, 0.003)
+    assert fit is not None and fit.how.own is not None
+    turn_rad = se3_log(fit.how.own.T_color_depth @ invert(PLACE))[:3]
+    assert (np.abs(turn_rad) < 3.0 * fit.turn_sigma_rad).all()
+    assert misplaced(found, found.rig) is None
+    registered = with_depth_format(found, DepthFormat(5000.0))  # as who has no calibration of it takes it to be
+    fit = misplaced(registered, found.rig)
+    check(fit, 0.6, 0.006)  # the lens is taken to have colour's centre: 1.5 px are 0.4 degrees
+    (found.root / "sensor.yaml").write_text(camera_text(COLOR, None, "drawn"))
+    for room in ("rgbd.judgement", "extrinsics"):  # it was found above
+        monkeypatch.setattr(f"vislam.datasets.{room}.misplaced", lambda *_: fit)
+    (said,) = (f for f in inspect(str(found.root)).findings if f.where == "depth0" and f.severity != "ok")
+    assert "does not lie where it is stated to be: depth sits at 4" in said.what and "calibrate rgbd" in said.next_step
+    assert misplaced_depth(open_dataset(str(found.root))) == f"{said.what}: {said.next_step}"
 
 
 def test_a_bare_wall_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

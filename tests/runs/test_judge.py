@@ -56,6 +56,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"frames_missing": 100}, "100 of 500 frames never arrived"),
         ({"frames_repeated": 40}, "40 images repeat the one before"),
         ({"dark_s": 2.5}, "images were dark for 2.5 s"),
+        ({"misplaced_depth": "depth sits elsewhere"}, "depth sits elsewhere"),
         ({"submaps_apart": 2}, "2 submaps"),
         ({"submaps_apart": 1, "apart_reason": "9 is at 4, or 1.0 m from there"}, "nothing (9 is at 4, or 1.0 m from"),
         ({"is_started": False, "start_reason": "gravity norm 1.00"}, "gravity was not found"),

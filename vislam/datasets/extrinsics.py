@@ -15,6 +15,7 @@ from vislam.core.recording import Problems, Recording, Wrapping
 from vislam.datasets.camera_turns import follow_turns, judged_turns, turn_places
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.plausibility import ImuFacts, imu_facts
+from vislam.datasets.rgbd import MEND, misplaced, misplaced_words
 from vislam.datasets.rig_checks import judged_cameras
 from vislam.datasets.stream import FileRecording, Survey, open_loader
 from vislam.datasets.tables import Row
@@ -65,6 +66,19 @@ def contradicted_extrinsics(recording: Recording, seen: Sequence[tuple[ImageU8, 
     except DataError:
         return ()  # what cannot be read is said elsewhere
     return tuple(f"{finding.what}: {finding.next_step}" for finding in findings if finding.severity == "error")
+
+
+def misplaced_depth(recording: Recording) -> str:
+    """Return how depth of a recording on disk lies elsewhere than stated, and what to do then; empty: it does not."""
+    while isinstance(recording, Wrapping):
+        recording = recording.wrapped()
+    if not isinstance(recording, FileRecording) or recording.survey.depth is None:
+        return ""
+    try:
+        place = misplaced(recording.survey, recording.rig)
+    except DataError:
+        return ""  # what cannot be read is said elsewhere
+    return "" if place is None else f"{misplaced_words(place)}: {MEND}"
 
 
 def _on_disk(recording: FileRecording, asks_places: bool) -> list[Finding]:

@@ -14,7 +14,7 @@ from vislam.core.memory import EdgeReport
 from vislam.core.messages import Array, GraphUpdate, ImageU8, KeyframePacket, LoopDecision, NavState, Tracking
 from vislam.core.recording import Recording
 from vislam.core.streams import Happening, StreamEvent
-from vislam.datasets.extrinsics import contradicted_extrinsics
+from vislam.datasets.extrinsics import contradicted_extrinsics, misplaced_depth
 from vislam.imu import Preintegrated, preintegrate
 from vislam.pipeline.front_report import FrontReport
 from vislam.runs.folder import RunLog
@@ -317,9 +317,11 @@ def judged(
 ) -> tuple[Evidence, Verdict]:
     """Return evidence and verdict; of a run that is not trusted with what contradicts its extrinsics.
 
-    They are the usual cause of a run that fails from its first frame on. `seen` is as for `contradicted_extrinsics`;
-    with None nothing is asked.
+    They are the usual cause of a run that fails from its first frame on. Depth of another lens is smooth and agrees
+    with itself, so it is asked of every run. `seen` is as for `contradicted_extrinsics`; with None nothing is asked.
     """
+    if seen is not None and recording.rig.has_depth:
+        evidence = replace(evidence, misplaced_depth=misplaced_depth(recording))
     verdict = judge(evidence, config)
     if verdict.state is not Trust.TRUSTED and seen is not None:
         evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen) + evidence.causes)

@@ -15,14 +15,13 @@ from matplotlib.figure import Figure
 
 from vislam.calibration.options import RgbdOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
-from vislam.core.angles import angles_of
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.recording import Problems
 from vislam.datasets import survey
 from vislam.datasets.calibration_text import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat
-from vislam.datasets.rgbd import Known, PlaceFit, RgbdFacts, fit_place, known, rgbd_facts
+from vislam.datasets.rgbd import Known, PlaceFit, RgbdFacts, fit_place, known, misplaced, rgbd_facts
 from vislam.datasets.stream import Survey, frame_table, with_depth_format
 from vislam.vision.depth_registration import DepthCamera
 
@@ -69,7 +68,7 @@ def fit_rgbd(source: str) -> RgbdCalibration:
         raise error
     if found.rig is None or found.depth is None:
         raise DataError(f"{source} has no depth images beside those of a calibrated camera")
-    place = None if found.depth_format.own is None else fit_place(found, found.rig)
+    place = (misplaced if found.depth_format.own is None else fit_place)(found, found.rig)
     if place is not None:
         found = with_depth_format(found, place.how)
     before = _measured(found)
@@ -136,11 +135,11 @@ def _mended(found: Survey, facts: RgbdFacts, sure: Known) -> Survey:
 def _statements(found: RgbdCalibration) -> list[str]:
     """Return what a user must know of how far the numbers can be trusted."""
     sure = {"the place of depth": found.sure.offset, "its lag": found.sure.lag, "the focal length": found.sure.focal}
-    stays = "as it was" if found.how.own is None else "near what was given"
+    lack = "could not be found and stays as it was" if found.how.own is None else "is only roughly known"
     if found.how.own is not None:
         sure = {"the focal length of colour": found.sure.focal} | _sure_of(found.place)
     unknown = [what for what, is_sure in sure.items() if not is_sure]
-    said = [f"{' and '.join(unknown)} could not be found and stays {stays}"] if unknown else []
+    said = [f"{' and '.join(unknown)} {lack}"] if unknown else []
     return [*said, *([] if found.how.own is None else [_CENTRE]), _SCALE]
 
 
@@ -161,8 +160,7 @@ def _lines(found: RgbdCalibration) -> list[str]:
     facts, camera, out = found.before, found.rig.cameras[0], []
     for odd in facts.odd_values:
         out.append(f"depth {odd.value} means that nothing was measured: {odd.share:.1%} of the pixels")
-    if found.place is not None and found.how.own is not None:
-        out += _place_lines(found.place, found.how.own)
+    out += [] if found.place is None else found.place.words
     if facts.edges is not None and found.sure.offset and found.how.own is None:
         sigma_px = facts.edges.offset_sigma_px
         dx, dy = found.how.offset_px
@@ -176,19 +174,6 @@ def _lines(found: RgbdCalibration) -> list[str]:
         ms, sigma_ms = 1e3 * facts.focal.readout_s, 1e3 * facts.focal.readout_sigma_s
         out.append(f"rolling shutter: {ms:.1f} ± {sigma_ms:.1f} ms from the first row to the last")
     return out
-
-
-def _place_lines(place: PlaceFit, own: DepthCamera) -> list[str]:
-    mm, sigma_mm = 1e3 * own.T_color_depth[:3, 3], 1e3 * place.place_sigma_m
-    turn_deg = np.rad2deg(angles_of(own.T_color_depth[None, :3, :3])[0])
-    where = ", ".join(f"{x:.1f} ± {s:.1f}" for x, s in zip(mm, sigma_mm, strict=True))
-    late_ms = -1e3 * place.how.time_offset_s
-    return [
-        f"depth sits at {where} mm right of, below and ahead of colour",
-        f"it is turned by {turn_deg:.2f} ± {np.rad2deg(np.linalg.norm(place.turn_sigma_rad)):.2f}°",
-        f"its focal length is {own.camera.fx:.1f} ± {place.focal_sigma * own.camera.fx:.1f} px",
-        f"it is late by {late_ms:.1f} ± {1e3 * place.lag_sigma_s:.1f} ms",
-    ]
 
 
 def _report(found: RgbdCalibration, statements: list[str]) -> dict[str, Any]:

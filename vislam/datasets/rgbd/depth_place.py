@@ -2,18 +2,21 @@
 
 Where foregrounds of registered depth end, the image has edges. Across every end the image's gradient is read; what is
 wrong with place, focal length and lag moves all ends by amounts that depend on where they are, how far and how fast.
-The parameters under which most gradient lies at the ends are searched, coarse to fine. Depth is registered again
-with what was found, three times. A shift of the principal point moves ends as a turn does, and is not distinguished.
+The parameters under which most gradient lies at the ends are searched, coarse to fine, from several focal lengths.
+Depth is registered again with what was found, three times. A shift of the principal point moves ends as a turn does,
+and is not distinguished.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from vislam.core.angles import angles_of
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import se3_exp
 from vislam.core.jackknife import jackknife_variances
@@ -25,7 +28,8 @@ from vislam.datasets.stream import Survey, frame_table, open_loader, with_depth_
 from vislam.vision.depth_edges import foreground_ends
 from vislam.vision.depth_registration import DepthCamera
 
-_FRAMES = 80
+_FRAMES, _FEW_FRAMES, _GLANCE_FRAMES = 80, 20, 12  # to measure, to compare, to see whether there is a need to
+_FOCAL_STARTS = tuple(1.15**k for k in range(-4, 4))  # of that stated, 0.57 to 1.52: a search reaches half a step
 _ENDS = 300  # of a frame
 _ROUNDS = ((32, (8.0, 4.0)), (20, (4.0, 2.0)), (12, (2.0, 1.2)))  # px: reach of a profile, and blurs of it in turn
 _NORMAL_SIGMA_PX = 2.0
@@ -37,6 +41,10 @@ _GROUPS = 12
 _WIDER = 3.0  # what all parts of a recording share (drawn scenes: up to 3 sigmas) no part shows that is left out
 _LEAST_FRAMES = 12
 _LEAST_ENDS = 2000
+# gradient at the ends over what lies around them, of depth at its place: 1.5 to 2.0 in 8 frames of two recordings, 0.9
+# to 1.15 where it has another lens
+_MET = 1.3
+_WIDTH_PX = 640.0  # of images in which that was seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +58,21 @@ class PlaceFit:
     lag_sigma_s: float
     ends: int
 
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Where depth is, how long its focal length is and how late it comes."""
+        own = self.how.own
+        assert own is not None
+        mm, sigma_mm = 1e3 * own.T_color_depth[:3, 3], 1e3 * self.place_sigma_m
+        turn_deg = np.rad2deg(angles_of(own.T_color_depth[None, :3, :3])[0])
+        where = ", ".join(f"{x:.1f} ± {s:.1f}" for x, s in zip(mm, sigma_mm, strict=True))
+        return (
+            f"depth sits at {where} mm right of, below and ahead of colour",
+            f"it is turned by {turn_deg:.2f} ± {np.rad2deg(np.linalg.norm(self.turn_sigma_rad)):.2f}°",
+            f"its focal length is {own.camera.fx:.1f} ± {self.focal_sigma * own.camera.fx:.1f} px",
+            f"it is late by {-1e3 * self.how.time_offset_s:.1f} ± {1e3 * self.lag_sigma_s:.1f} ms",
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Ends:
@@ -60,27 +83,78 @@ class _Ends:
     given_px: Array  # [N] by which they are moved in any case, as depth and colour are stamped
 
 
-def fit_place(found: Survey, rig: Rig, progress: Progress = silent) -> PlaceFit | None:
-    """Find place, focal length and lag of depth with a lens of its own; None where too few foregrounds end.
+def misplaced(found: Survey, rig: Rig, progress: Progress = silent) -> PlaceFit | None:
+    """Find depth that is not where it is stated to be, be it registered or with a lens of its own; None: it is.
 
-    Raises DataError when an image is not of the calibrated size.
+    None also where too few foregrounds end, or nothing makes them meet edges of the image. Raises as `fit_place`.
     """
-    how, frames = found.depth_format, list[_Ends]()
-    theta = np.zeros(len(_PRIOR))
+    if np.count_nonzero(frame_table(found, Problems()).depth_rows >= 0) < _LEAST_FRAMES:
+        return None
+    stated = _met_at_a_glance(found, rig)
+    if stated is None or stated > _MET or (fit := fit_place(found, rig, progress)) is None:
+        return None
+    at_fit = _met_at_a_glance(with_depth_format(found, fit.how), rig)
+    return fit if at_fit is not None and at_fit > max(_MET, _MET * stated) else None
+
+
+def _met_at_a_glance(found: Survey, rig: Rig) -> float | None:
+    """Return how much more gradient a few frames have at the ends than around them; None where too few end."""
+    (reach, blurs), scale = _ROUNDS[0], rig.cameras[0].width / _WIDTH_PX
+    seen = _walk(found, rig, round(reach * scale), silent, _GLANCE_FRAMES)
+    if not _is_enough(seen, _GLANCE_FRAMES / _FRAMES):
+        return None
+    return _Search(seen, blurs[-1] * scale).met(np.zeros(len(_PRIOR)))
+
+
+def fit_place(found: Survey, rig: Rig, progress: Progress = silent) -> PlaceFit | None:
+    """Find place, focal length and lag of depth; None where too few foregrounds end.
+
+    Depth that is stated to be registered is looked for beside colour, with a lens like it. Raises DataError when an
+    image is not of the calibrated size.
+    """
+    how = _start(found, rig, progress)
+    theta, frames = np.zeros(len(_PRIOR)), list[_Ends]()
     for reach, blurs in _ROUNDS:
         frames = _walk(with_depth_format(found, how), rig, reach, progress)
-        if len(frames) < _LEAST_FRAMES or sum(len(one.profiles) for one in frames) < _LEAST_ENDS:
+        if not _is_enough(frames):
             return None
-        theta = np.zeros(len(_PRIOR))
-        for blur in blurs:
-            theta = _best(frames, blur, theta)
+        theta = _found(frames, blurs)
         how = _changed(how, theta)
     # the neighbours of a frame show the same ends: whole stretches are left out
     groups = [frames[k * len(frames) // _GROUPS : (k + 1) * len(frames) // _GROUPS] for k in range(_GROUPS)]
     parts = [[one for other in groups if other is not group for one in other] for group in groups]
-    sigma = _WIDER * np.sqrt(jackknife_variances(np.array([_best(part, _ROUNDS[-1][1][-1], theta) for part in parts])))
+    blurs = _ROUNDS[-1][1]
+    sigma = _WIDER * np.sqrt(jackknife_variances(np.array([_found(part, blurs) for part in parts])))
     count = sum(len(one.profiles) for one in frames)
     return PlaceFit(how, sigma[:3], sigma[3:6], float(sigma[6]), float(sigma[7]), count)
+
+
+def _start(found: Survey, rig: Rig, progress: Progress) -> DepthFormat:
+    """Return the lens to begin with: the focal length from which most gradient is met."""
+    how, (reach, blurs) = found.depth_format, _ROUNDS[0]
+    straight = replace(rig.cameras[0], distortion="none", coefficients=())
+    stated = how.own or DepthCamera(straight, np.eye(4))
+    tried = []
+    for n, factor in enumerate(_FOCAL_STARTS):
+        progress(n + 1, len(_FOCAL_STARTS), "lens of depth")
+        start = replace(how, own=DepthCamera(stated.camera.with_focal(factor), stated.T_color_depth))
+        frames = _walk(with_depth_format(found, start), rig, reach, silent, _FEW_FRAMES)
+        if frames:
+            tried.append((_Search(frames, blurs[-1]).met(_found(frames, blurs)), start))
+    return max(tried, key=lambda one: one[0])[1] if tried else replace(how, own=stated)
+
+
+def _is_enough(frames: list[_Ends], share: float = 1.0) -> bool:
+    count = sum(len(one.profiles) for one in frames)
+    return len(frames) >= share * _LEAST_FRAMES and count >= share * _LEAST_ENDS
+
+
+def _found(frames: list[_Ends], blurs: Sequence[float]) -> Array:
+    """Return the parameters [9] that a search finds, from coarse to fine."""
+    theta = np.zeros(len(_PRIOR))
+    for blur in blurs:
+        theta = _Search(frames, blur).best(theta)
+    return theta
 
 
 def _changed(how: DepthFormat, theta: Array) -> DepthFormat:
@@ -90,11 +164,11 @@ def _changed(how: DepthFormat, theta: Array) -> DepthFormat:
     return replace(how, own=DepthCamera(lens, np.asarray(T)), time_offset_s=how.time_offset_s - float(theta[7]))
 
 
-def _walk(found: Survey, rig: Rig, reach: int, progress: Progress) -> list[_Ends]:
+def _walk(found: Survey, rig: Rig, reach: int, progress: Progress, most: int = _FRAMES) -> list[_Ends]:
     frames = frame_table(found, Problems())
     assert found.depth is not None
     usable = np.flatnonzero(frames.depth_rows[:-1] >= 0)
-    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES).astype(int))] if len(usable) else usable
+    chosen = usable[np.unique(np.linspace(0, len(usable) - 1, most).astype(int))] if len(usable) else usable
     out = []
     flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     with closing(open_loader(found, rig, frames, 1)) as loader:
@@ -145,24 +219,43 @@ def _ends(camera: Camera, depth_m: ImageF32, image: ImageU8, speed: ImageF32, de
     return _Ends(profiles[usable], moves[usable], (-along * delay_s)[usable])
 
 
-def _best(frames: list[_Ends], blur: float, start: Array) -> Array:
-    """Return the parameters [9] under which most gradient lies at the ends."""
-    profiles = np.vstack([one.profiles for one in frames]).astype(np.float32)
-    profiles = cv2.GaussianBlur(profiles, (2 * int(3 * blur) + 1, 1), blur, sigmaY=0.1, borderType=cv2.BORDER_REPLICATE)
-    moves = np.vstack([one.moves for one in frames]) * _PRIOR
-    given = np.concatenate([one.given_px for one in frames])
-    from scipy.optimize import minimize  # doctor does not come here
+class _Search:
+    """Looks for the parameters under which most gradient lies at the ends."""
 
-    reach = profiles.shape[1] // 2
-    rows = np.arange(len(profiles))
-    weight = _WEIGHT / float(profiles.mean())
+    def __init__(self, frames: list[_Ends], blur: float) -> None:
+        profiles, size = np.vstack([one.profiles for one in frames]).astype(np.float32), 2 * int(3 * blur) + 1
+        self._profiles = cv2.GaussianBlur(profiles, (size, 1), blur, sigmaY=0.1, borderType=cv2.BORDER_REPLICATE)
+        self._moves = np.vstack([one.moves for one in frames]) * _PRIOR
+        self._given = np.concatenate([one.given_px for one in frames])
+        self._mean = float(profiles.mean())
 
-    def cost(x: Array) -> tuple[float, Array]:
-        place = np.clip(given + moves @ x + reach, 0.0, 2.0 * reach - 1e-6)
-        left = place.astype(np.int64)
-        low, high = profiles[rows, left], profiles[rows, left + 1]
-        value = low + (high - low) * (place - left)
-        slope = np.where((place > 0.0) & (place < 2.0 * reach - 1e-5), high - low, 0.0)
-        return float(0.5 * x @ x - weight * value.sum()), x - weight * (slope @ moves)
+    def met(self, theta: Array) -> float:
+        """Return the gradient at the ends over what lies around them, by parameters [9]."""
+        return float(self._at(theta / _PRIOR)[0].mean()) / self._mean
 
-    return np.asarray(minimize(cost, start / _PRIOR, jac=True, method="L-BFGS-B").x) * _PRIOR
+    def best(self, start: Array) -> Array:
+        """Return the best parameters [9]."""
+        from scipy.optimize import minimize  # doctor seldom comes here
+
+        weight = _WEIGHT / self._mean
+
+        def cost(x: Array) -> tuple[float, Array]:
+            value, slope = self._at(x)
+            return float(0.5 * x @ x - weight * value.sum()), x - weight * (slope @ self._moves)
+
+        return np.asarray(minimize(cost, start / _PRIOR, jac=True, method="L-BFGS-B").x) * _PRIOR
+
+    def _at(self, x: Array) -> tuple[Array, Array]:
+        """Return the gradient [N] at the ends, and its derivatives by where they are.
+
+        By quadratic B-splines: a kink at whole pixels would end the search where it begins, for ends lie on these.
+        """
+        reach = self._profiles.shape[1] // 2
+        given = self._given + self._moves @ x + reach
+        place = np.clip(given, 1.0, 2.0 * reach - 1.0)
+        rows, middle = np.arange(len(place)), np.rint(place).astype(np.int64)
+        t = place - middle
+        low, here, high = (self._profiles[rows, middle + k] for k in (-1, 0, 1))
+        value = 0.5 * (0.5 - t) ** 2 * low + (0.75 - t**2) * here + 0.5 * (0.5 + t) ** 2 * high
+        slope = (t - 0.5) * low - 2.0 * t * here + (t + 0.5) * high
+        return value, np.where(place == given, slope, 0.0)

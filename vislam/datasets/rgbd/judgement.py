@@ -11,6 +11,7 @@ from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.progress import Progress
 from vislam.datasets.loaders import FrameTable
+from vislam.datasets.rgbd.depth_place import PlaceFit, misplaced
 from vislam.datasets.rgbd.facts import RgbdFacts, rgbd_facts
 from vislam.datasets.stream import Survey
 
@@ -22,7 +23,7 @@ _SURE = 2.5  # sigmas beyond nothing
 _MOST_OFFSET_SIGMA_PX, _MOST_LAG_SIGMA_S, _MOST_FOCAL_SIGMA = 2.0, 0.010, 0.010  # beyond these no judgement is possible
 _DEPTHS_M = (0.15, 40.0)  # of the median, of any sensor in any room
 _LEAST_CONTRAST = 1.04  # of the edges' peak
-_MEND = "`vislam calibrate rgbd` writes a sensor.yaml that mends it"
+MEND = "`vislam calibrate rgbd` writes a sensor.yaml that mends it"
 
 What = Literal["invalid value", "unit", "offset", "lag", "focal length"]
 
@@ -35,7 +36,7 @@ class RgbdFault:
     size: float  # raw value, metres, pixels, seconds, or true over given minus one
     sigma: float
     text: str
-    next_step: str = _MEND
+    next_step: str = MEND
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ def _number_faults(facts: RgbdFacts) -> list[RgbdFault]:
     out = []
     for odd in facts.odd_values:
         text = f"depth {odd.value} in {odd.share:.1%} of the pixels means that nothing was measured"
-        step = "it is read so; 0 would be usual" if odd.is_known else _MEND
+        step = "it is read so; 0 would be usual" if odd.is_known else MEND
         out.append(RgbdFault("invalid value", odd.value, 0.0, text, step))
     if not np.isnan(facts.median_depth_m) and not _DEPTHS_M[0] <= facts.median_depth_m <= _DEPTHS_M[1]:
         text = f"half of the depths are below {facts.median_depth_m:.3g} m: the unit is wrong"
@@ -105,6 +106,11 @@ def _focal_faults(facts: RgbdFacts) -> list[RgbdFault]:
     return [RgbdFault("focal length", off, sigma, text)]
 
 
+def misplaced_words(place: PlaceFit) -> str:
+    """Return what is wrong with depth that is somewhere else."""
+    return f"depth does not lie where it is stated to be: {', '.join(place.words)}"
+
+
 def offset_words(offset_px: np.typing.NDArray[np.float64]) -> str:
     """Return an offset in words: 6.0 px right and 3.0 px up."""
     dx, dy = (float(x) for x in offset_px)
@@ -118,8 +124,13 @@ def rgbd_findings(found: Survey, frames: FrameTable | None, progress: Progress) 
         return [], frozenset()
     try:
         facts = rgbd_facts(found, rig, frames, progress)
+        is_at_home = known(facts).offset and not _place_faults(facts, rig.cameras[0].width)
+        place = None if is_at_home else misplaced(found, rig, progress)
     except DataError as error:
         return [Finding("error", str(error), "depth0", "see docs/formats.md")], frozenset()
+    if place is not None:
+        out = [Finding("warning", fault.text, "depth0", fault.next_step) for fault in _number_faults(facts)]
+        return [Finding("warning", misplaced_words(place), "depth0", MEND), *out], facts.depth_rows
     faults = rgbd_faults(facts, rig.cameras[0].width)
     out = [Finding("warning", fault.text, "depth0", fault.next_step) for fault in faults]
     wrong = {fault.what for fault in faults}

@@ -116,6 +116,7 @@ class Evidence:
     turns: TurnAgreement | None = None
     forces: ForceAgreement | None = None
     driven: tuple[Driven, ...] = ()
+    misplaced_depth: str = ""  # where depth is that does not lie where it is stated to be
     # inertial data
     gyro_noise: float | None = None  # rad/s/sqrt(Hz), white noise in the quietest half second
     accel_noise: float | None = None  # m/s^2/sqrt(Hz)

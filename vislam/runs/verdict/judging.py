@@ -232,6 +232,8 @@ def _graph(e: Evidence, _: VerdictConfig) -> Iterator[str]:
 
 def _calibration(e: Evidence, c: VerdictConfig) -> Iterator[str]:
     turns, forces = e.turns, e.forces
+    if e.misplaced_depth:
+        yield e.misplaced_depth
     if turns is not None and (apart_deg := math.degrees(turns.worst_rad)) > _GYRO_NOISE_DEG:
         yield (
             f"one in ten turns between keyframes is {apart_deg:.1f} degrees or more apart by vision and by gyroscope: "
