@@ -24,7 +24,7 @@ from vislam.core.geometry import invert, so3_exp, so3_log
 from vislam.datasets import survey
 from vislam.datasets.calibration_text import camera_text, depth_keys_text
 from vislam.datasets.images import DepthFormat, read_depth
-from vislam.datasets.rgbd import fit_place
+from vislam.datasets.rgbd import fit_place, misplaced
 from vislam.datasets.stream import Survey, with_depth_format
 from vislam.vision.depth_registration import DepthCamera, DepthRegistration
 
@@ -92,12 +92,32 @@ def found_again(source: str, truth: DepthFormat) -> str:
     )
 
 
+def as_registered(source: Path, truth: DepthFormat, out: Path) -> str:
+    """Return how depth that is taken for registered is judged, and the error by what is found of it then."""
+    (source / "sensor.yaml").write_text(camera_text(survey(str(source)).rig.cameras[0], None, "made up"))
+    seen = survey(str(source))
+    assert seen.rig is not None and truth.own is not None
+    fit = misplaced(seen, seen.rig)
+    if fit is None or fit.how.own is None:
+        return "taken for registered"
+    (source / "sensor.yaml").write_text(camera_text(seen.rig.cameras[0], None, "found") + depth_keys_text(fit.how))
+    mm = 1e3 * (fit.how.own.T_color_depth - truth.own.T_color_depth)[:3, 3]
+    return (
+        f"place {mm.round(1)} mm, focal length {fit.how.own.camera.fx / truth.own.camera.fx - 1.0:+.2%}, "
+        f"{ate_m(str(source), out):.4f} m"
+    )
+
+
 def main() -> None:
     """Run the cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source")
     parser.add_argument("--cases", type=int, nargs="+", default=list(range(CASES)))
-    parser.add_argument("--calibrate", action="store_true", help="find the camera, too, from a start that is off")
+    parser.add_argument(
+        "--calibrate",
+        action="store_true",
+        help="find the camera, too, from a start that is off, and with nothing stated",
+    )
     args = parser.parse_args()
     found = survey(args.source)
     with tempfile.TemporaryDirectory() as temporary:
@@ -111,6 +131,7 @@ def main() -> None:
             print(f"{case}: {seen_m:.4f} m, {seen_m / own_m:.2f} of it", flush=True)
             if args.calibrate:
                 print(f"   {found_again(str(folder), how)}", flush=True)
+                print(f"   as registered: {as_registered(folder, how, root / f'found{case}')}", flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 
 from vislam.core.angles import angles_of
 from vislam.core.camera import Camera, Rig
-from vislam.core.geometry import se3_exp
+from vislam.core.geometry import invert, se3_exp, se3_log
 from vislam.core.jackknife import jackknife_variances
 from vislam.core.messages import Array, ImageF32, ImageU8
 from vislam.core.progress import Progress, silent
@@ -44,6 +44,7 @@ _LEAST_ENDS = 2000
 # gradient at the ends over what lies around them, of depth at its place: 1.5 to 2.0 in 8 frames of two recordings, 0.9
 # to 1.15 where it has another lens
 _MET = 1.3
+_SURE = 2.5  # sigmas beyond nothing
 _WIDTH_PX = 640.0  # of images in which that was seen
 
 
@@ -57,6 +58,14 @@ class PlaceFit:
     focal_sigma: float  # relative, of depth
     lag_sigma_s: float
     ends: int
+
+    def moves(self, own: DepthCamera) -> bool:
+        """Whether depth surely sits elsewhere than `own` has it, or has another focal length."""
+        assert self.how.own is not None
+        moved = se3_log(self.how.own.T_color_depth @ invert(own.T_color_depth))
+        longer = self.how.own.camera.fx / own.camera.fx - 1.0
+        sigmas = np.array([*self.turn_sigma_rad, *self.place_sigma_m, self.focal_sigma])
+        return bool((np.abs([*moved, longer]) > _SURE * sigmas).any())
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -94,7 +103,8 @@ def misplaced(found: Survey, rig: Rig, progress: Progress = silent) -> PlaceFit 
     if stated is None or stated > _MET or (fit := fit_place(found, rig, progress)) is None:
         return None
     at_fit = _met_at_a_glance(with_depth_format(found, fit.how), rig)
-    return fit if at_fit is not None and at_fit > max(_MET, _MET * stated) else None
+    is_better = at_fit is not None and at_fit > max(_MET, _MET * stated)
+    return fit if is_better and fit.moves(_stated(found, rig)) else None
 
 
 def _met_at_a_glance(found: Survey, rig: Rig) -> float | None:
@@ -129,12 +139,16 @@ def fit_place(found: Survey, rig: Rig, progress: Progress = silent) -> PlaceFit 
     return PlaceFit(how, sigma[:3], sigma[3:6], float(sigma[6]), float(sigma[7]), count)
 
 
+def _stated(found: Survey, rig: Rig) -> DepthCamera:
+    """Return where depth is stated to be; registered depth has colour's lens, but for what undistorting it did."""
+    straight = replace(rig.cameras[0], distortion="none", coefficients=())
+    return found.depth_format.own or DepthCamera(straight, np.eye(4))
+
+
 def _start(found: Survey, rig: Rig, progress: Progress) -> DepthFormat:
     """Return the lens to begin with: the focal length from which most gradient is met."""
     how, (reach, blurs) = found.depth_format, _ROUNDS[0]
-    straight = replace(rig.cameras[0], distortion="none", coefficients=())
-    stated = how.own or DepthCamera(straight, np.eye(4))
-    tried = []
+    stated, tried = _stated(found, rig), []
     for n, factor in enumerate(_FOCAL_STARTS):
         progress(n + 1, len(_FOCAL_STARTS), "lens of depth")
         start = replace(how, own=DepthCamera(stated.camera.with_focal(factor), stated.T_color_depth))
