@@ -135,6 +135,8 @@ R4, K4 = "k1 k2 p1 p2", "k1 k2 k3 k4"
         (orb("PinHole", R4, RADTAN.coefficients, BODY), RADTAN, [T0], None),
         (orb("PinHole", R4, RADTAN.coefficients, matrix("Tbc", T0), ("Camera",)), RADTAN, [T0], None),
         (orb("KannalaBrandt8", K4, FISHEYE.coefficients, STEREO, BOTH), FISHEYE, [T0, T0 @ T01], None),
+        (orb("KannalaBrandt8", K4, FISHEYE.coefficients, BODY + "Stereo.b: 0.05\n" + matrix("Tlr", T01[:3]), BOTH),
+         FISHEYE, [T0, T0 @ T01], None),
         (orb("Rectified", "", (), BODY + "Stereo.b: 0.05\n"), Camera(*SIZE, *PINHOLE), [T0, T0 @ SHIFT], None),
         (orb("PinHole", "k1 k2", (0.0, 0.0), matrix("Tbc", T0) + "Camera.bf: 2.5\n"), Camera(*SIZE, *PINHOLE),
          [T0, T0 @ SHIFT], None),
@@ -158,6 +160,7 @@ R4, K4 = "k1 k2 p1 p2", "k1 k2 k3 k4"
         (ECHO.replace("D:", "d:").replace("K:", "k:") + "---\n", RADTAN, [None], None),
         (f"mtx: [{K_TEXT}]\ndist: [[-0.1, 0.01, 1e-4, 2e-4, 0]]\nimageSize: [64, 48]\n", RADTAN, [None], None),
         (opencv(D4, more="xi: 1.0\n"), MEI, [None], None),
+        (re.sub(r"  T_B_C.*\n", "", MAPLAB[: MAPLAB.index("- camera", 30)]), FISHEYE, [None], None),
     ],
 )  # fmt: skip
 def test_files_of_other_programs_are_read(
@@ -250,6 +253,8 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (orb("PinHole", R4, RADTAN.coefficients, matrix("LEFT.K", T0)), "older settings with LEFT.K"),
         (orb("PinHole", R4, RADTAN.coefficients, "").replace("Camera.width: 64\n", ""), "ORB-SLAM.*no 'Camera.width'"),
         (orb("PinHole", R4, RADTAN.coefficients, matrix("IMU.T_b_c1", 2.0 * T0)), "not a rigid transform"),
+        (orb("PinHole", R4, RADTAN.coefficients, matrix("Tbc", T0.T)), "Tbc is not a rigid transform"),
+        (vins_lens() + VINS.replace(str(T0[0, 0]), "2.0"), "extrinsicRotation is not a rigid transform"),
         (ECHO.replace("binning_x: 0", "binning_x: 2"), "binning and parts of an image are not read"),
         (ECHO + "roi: {x_offset: 9, y_offset: 0}\n", "binning and parts of an image are not read"),
         (opencv(D5, size=""), "without image size; add image_width"),

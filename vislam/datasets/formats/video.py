@@ -30,7 +30,7 @@ from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.imu_tables import Pair, pair_in
 from vislam.datasets.loaders import check_film
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import Row, read_frame_stamps
+from vislam.datasets.tables import Row, film_stamps, read_frame_stamps
 from vislam.datasets.telemetry import (
     Film,
     JoinedTelemetry,
@@ -76,7 +76,7 @@ def _survey(path: Path, joined: bool) -> Survey:
     imu_file, imu_noise, T_body_imu = None, None, np.eye(4)
     cameras: tuple[ImageList, ...] = ()
     film: Film | None = None
-    joined = joined and not path.with_suffix(".csv").is_file() and not path.with_suffix(".imu.csv").is_file()
+    joined = joined and not film_stamps(path).is_file() and not path.with_suffix(".imu.csv").is_file()
     rig, telemetry = None, _telemetry(path, joined)
     findings = [] if telemetry is None else telemetry.findings()
     if (why := _why_unused(path)) and telemetry is not None and telemetry.has_imu:
@@ -127,7 +127,7 @@ def _imu(path: Path) -> tuple[ImuNoise, NDArray[np.float64]]:
 
 
 def _frames(path: Path, problems: Problems, own_clock: bool) -> ImageList:
-    stamps = path.with_suffix(".csv")
+    stamps = film_stamps(path)
     if stamps.is_file():
         return image_list("cam0", path.parent, read_frame_stamps(stamps, problems), problems)
     if is_mp4(path) and not own_clock:  # else the IMU would have another
@@ -156,8 +156,8 @@ def _why_unused(path: Path) -> str:
     """Return why the IMU of a telemetry is left aside, empty where it is not."""
     if path.with_suffix(".imu.csv").is_file():
         return f"{path.with_suffix('.imu.csv').name} takes its place"
-    if path.with_suffix(".csv").is_file():
-        return f"its clock is the video's, and {path.with_suffix('.csv').name} stamps the frames by another"
+    if (stamps := film_stamps(path)).is_file():
+        return f"its clock is the video's, and {stamps.name} stamps the frames by another"
     if not path.with_suffix(".imu.yaml").is_file():
         return f"write its noise into {path.with_suffix('.imu.yaml').name}, see docs/formats.md"
     return ""
