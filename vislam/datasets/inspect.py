@@ -234,7 +234,8 @@ class _Inspector:
 
     def _check_imu(self) -> ImuFacts | None:
         if not self._found.has_imu:
-            self._add("ok", "no IMU: vision alone gives the motion", str(self._found.root))
+            if self._found.cameras:
+                self._add("ok", "no IMU: vision alone gives the motion", str(self._found.root))
             return None
         if self._found.imu_file is not None:
             self._size_bytes += self._found.imu_file.stat().st_size
@@ -335,7 +336,7 @@ class _Inspector:
 
     def _check_truth(self, frames: FrameTable | None) -> None:
         if self._found.truth is None:
-            self._add("ok", "no truth: it can be run but not scored", str(self._found.root))
+            self._add("ok", "no truth: a run is not scored", str(self._found.root))
             return
         try:
             truth = self._found.truth(self._problems)
