@@ -366,7 +366,7 @@ def run_targets(folder: Path) -> list[Target]:
         "optimize": [["optimize", "RUN", "--no-report", "--rounds", "1"], ["loops", "RUN", "--undo", "0"]],
         "join": [["optimize", "RUN", str(folder / "points"), "--out", "OUT", "--no-report"]],
         "export": [["export", "RUN", "--mcap", "OUT.mcap", "--colmap", "OUT", "--splats", "OUT.ply"]],
-        "map": [["map", "RUN", "--products", "cloud", "octomap"], ["map", "RUN", "--out", "OUT", "--poses", "ekf"]],
+        "rebuild": [["map", "RUN", "--products", "cloud", "octomap"], ["map", "RUN", "--out", "OUT", "--poses", "ekf"]],
         "resume": [["run", "--resume", "RUN"]],
         "begin in": [["run", short, "--map", "RUN", "--out", "OUT", "--view.no-enabled", "--map.no-enabled"]],
     }
@@ -375,7 +375,7 @@ def run_targets(folder: Path) -> list[Target]:
         Target("session", [{"session.db": points["session.db"]}], lambda at: _read_session(at, whole)),
         *(
             Target(
-                f"{name} bomb", [room if name in ("export", "map") else points],
+                f"{name} bomb", [room if name in ("export", "rebuild") else points],
                 partial(_work_on, lines, outside, _files(outside)), 5,
                 made=partial(bombs.run_bomb, outside=outside),
             )

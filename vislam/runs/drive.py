@@ -231,7 +231,7 @@ class Run:
             self.joined_t_ns = packet.keyframe.t_ns
 
     def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
-        mapper = None if is_brief else self._mapper
+        mapper, self.witness.is_hurried = None if is_brief else self._mapper, is_brief
         finish = self.slam.finish()
         for step in finish.steps:
             self._take(step)

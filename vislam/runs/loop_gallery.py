@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.files import replacing
 from vislam.core.messages import Array, ImageU8, LoopDecision
 from vislam.loop import LoopRow
 from vislam.pipeline.steps import KeyframeStep
@@ -80,7 +81,8 @@ class LoopGallery:
             picture = self._draw(row, matches[k].astype(np.float64))
             with storage(path):
                 path.parent.mkdir(exist_ok=True)
-                path.write_bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+                with replacing(path) as file:
+                    file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
             written.append((row, path))
         return written
 
