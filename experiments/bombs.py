@@ -17,6 +17,7 @@ import tempfile
 import zipfile
 import zlib
 from contextlib import closing, suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +224,8 @@ def run_bomb(rng: np.random.Generator, sound: dict[str, bytes], outside: Path) -
             files |= {"map": Link(str(outside).encode())}
             files = {name: data for name, data in files.items() if not name.startswith("map/")}
         else:
-            files[name] = _stored_bomb(rng, ending, data)
+            with suppress(ValueError, sqlite3.Error):  # what was cut short in an earlier round
+                files[name] = _stored_bomb(rng, ending, data)
     return files
 
 
@@ -248,7 +250,7 @@ def json_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
             holder, key = at, (str(rng.choice(sorted(at))) if isinstance(at, dict) else int(rng.integers(len(at))))
             at = at[key]
         if key is not None:
-            holder[key] = _ODD[int(rng.integers(len(_ODD)))]
+            holder[key] = deepcopy(_ODD[int(rng.integers(len(_ODD)))])
     text = json.dumps(data)
     depth = int(10 ** rng.uniform(0, 4.5))
     return (

@@ -26,7 +26,7 @@ import traceback
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, redirect_stderr, redirect_stdout
+from contextlib import closing, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -206,6 +206,7 @@ def run_cases(
                 os.close(reader)
                 _work(map(named, range(at, end)), seed, Path(scratch), writer, until)
             os.close(writer)
+            answer: Answer | None = Answer("read", "", 0.0, 0)
             for answer in _answers(reader):
                 _count(tallies, *named(at), answer or Answer("HANG", "killed", LIMIT_S, 0), seed, keep)
                 at += 1
@@ -214,8 +215,9 @@ def run_cases(
                     break
             os.close(reader)
             _, status = os.waitpid(child, 0)
-            if os.WIFSIGNALED(status) and os.WTERMSIG(status) != signal.SIGKILL and at < end:
-                _count(tallies, *named(at), Answer("CRASH", f"signal {os.WTERMSIG(status)}", 0.0, 0), seed, keep)
+            if status and answer is not None and at < end:  # and was not killed here
+                how = f"ended with {os.waitstatus_to_exitcode(status)}"
+                _count(tallies, *named(at), Answer("CRASH", how, 0.0, 0), seed, keep)
                 at += 1
     return tallies
 
@@ -372,11 +374,12 @@ def run_targets(folder: Path) -> list[Target]:
     }
     return [
         Target("run folder", [points], _read_run, 1),
+        Target("stored bomb", [points, room], _read_stored, made=partial(bombs.run_bomb, outside=outside)),
         Target("session", [{"session.db": points["session.db"]}], lambda at: _read_session(at, whole)),
         *(
             Target(
                 f"{name} bomb", [room if name in ("export", "rebuild") else points],
-                partial(_work_on, lines, outside, _files(outside)), 5,
+                partial(_work_on, lines, outside, _files(outside)), 2,
                 made=partial(bombs.run_bomb, outside=outside),
             )
             for name, lines in verbs.items()
@@ -822,6 +825,29 @@ def _read_run(folder: Path) -> None:
         _verb(*arguments)
     read_metrics(folder)
     read_setup(folder)
+
+
+def _read_stored(folder: Path) -> None:
+    """Read what a run left by the functions that verbs call, each for itself."""
+    from vislam.runs.loaded import load_run
+    from vislam.runs.folder import read_setup
+    from vislam.runs.offline.evaluated import read_evaluated
+    from vislam.runs.report.run_files import read_run
+    from vislam.runs.session import Session, recall
+
+    def session(folder: Path) -> None:
+        with closing(Session(folder / "session.db")) as stored:
+            recall(stored)
+            stored.factor_log()
+            stored.config()
+            for many in (stored.keyframes(), stored.edges(), stored.scans(), stored.shifts(), stored.retrieved()):
+                for _ in many:
+                    pass
+
+    readers: tuple[Callable[[Path], object], ...] = (load_run, read_setup, read_evaluated, read_run, session)
+    for read in readers:
+        with suppress(VislamError):
+            read(folder)
 
 
 def _read_session(folder: Path, whole: list[str]) -> None:
