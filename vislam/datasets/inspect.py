@@ -144,9 +144,8 @@ class _Inspector:
     def _add_problem(self, kind: str, count: int, frames: FrameTable | None) -> None:
         total = len(frames.t_ns) if frames is not None else 0
         minor = kind == "frame without depth" and count < 0.2 * total
-        self._add(
-            "ok" if minor else "warning", f"{kind}: {count}", self._found.root.name, "skipped or bridged in a run"
-        )
+        severity: Severity = "ok" if minor else "warning"
+        self._add(severity, f"{kind}: {count}", self._found.root.name, "skipped or bridged in a run")
 
     def _check_stream(self, name: str, t_ns: Stamps) -> None:
         """Summarise a stream and judge how even it is."""
