@@ -28,7 +28,7 @@ from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.imu_tables import Pair, pair_in
-from vislam.datasets.loaders import check_film
+from vislam.datasets.loaders import check_film, open_video
 from vislam.datasets.stream import Survey, image_list
 from vislam.datasets.tables import Row, film_stamps, read_frame_stamps
 from vislam.datasets.telemetry import (
@@ -132,6 +132,7 @@ def _frames(path: Path, problems: Problems, own_clock: bool) -> ImageList:
         return image_list("cam0", path.parent, read_frame_stamps(stamps, problems), problems)
     if is_mp4(path) and not own_clock:  # else the IMU would have another
         return image_list("cam0", path.parent, _own_times(path), problems)
+    open_video(path).release()  # a film that cannot be read is what is wrong first
     raise DataError(f"{stamps} is missing; write one row a frame into it: the time of its exposure in ns")
 
 
