@@ -739,7 +739,6 @@ def _read_tracks(folder: Path) -> None:
 
 
 def _maps() -> list[dict[str, bytes]]:
-    from vislam.mapping.formats.pcd import write_pcd
     from vislam.mapping.formats.ply import write_ply
     from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
     from vislam.mapping.octree.tree import OctreeLeaves
@@ -752,18 +751,16 @@ def _maps() -> list[dict[str, bytes]]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_ply(folder / "a.ply", points, colors)
-        write_pcd(folder / "a.pcd", points, colors)
         written = [{path.name: path.read_bytes()} for path in sorted(folder.iterdir())]
     return [{"a.bt": encode_bt(octree)}, {"a.ot": encode_ot(octree)}, *written]
 
 
 def _read_maps(folder: Path) -> None:
-    from vislam.mapping.formats.pcd import read_pcd
     from vislam.mapping.formats.ply import read_ply
     from vislam.mapping.octree.octomap_io import read_octree
 
     for path in folder.iterdir():
-        read: Callable[[Path], object] = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix, read_octree)
+        read: Callable[[Path], object] = read_ply if path.suffix == ".ply" else read_octree
         read(path)
 
 
@@ -829,8 +826,8 @@ def _read_run(folder: Path) -> None:
 
 def _read_stored(folder: Path) -> None:
     """Read what a run left by the functions that verbs call, each for itself."""
-    from vislam.runs.loaded import load_run
     from vislam.runs.folder import read_setup
+    from vislam.runs.loaded import load_run
     from vislam.runs.offline.evaluated import read_evaluated
     from vislam.runs.report.run_files import read_run
     from vislam.runs.session import Session, recall

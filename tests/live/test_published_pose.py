@@ -304,11 +304,11 @@ def said_as(user: str, groups: list[int], act: Callable[[], str]) -> str:
     if not (child := os.fork()):
         try:
             os.setgroups(groups)
-            os.setgid(pwd.getpwnam(user).pw_gid)
             os.setuid(pwd.getpwnam(user).pw_uid)
-            os.write(writer, act().encode())
+            said = act()
         except BaseException as error:
-            os.write(writer, f"{error}".encode())
+            said = str(error)
+        os.write(writer, said.encode())
         os._exit(0)
     os.waitpid(child, 0)
     os.close(writer)
