@@ -324,7 +324,7 @@ class Run:
         if back is not None:
             counters |= back.counters
         gathered = self._evidence(front, final)
-        evidence, verdict = judged(gathered, self.config.verdict, self.recording, self.witness.seen)
+        evidence, verdict = judged(gathered, self.config.verdict, self.recording, self.witness.seen, front.turns)
         self.warnings += front.noise_warnings
         found = self._found_in_map()
         by_truth, not_compared = accuracy(self.log, final, truth, front.alignment, self._input.problems)

@@ -313,15 +313,19 @@ def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart
 
 
 def judged(
-    evidence: Evidence, config: VerdictConfig, recording: Recording, seen: Sequence[tuple[ImageU8, ...]] | None
+    evidence: Evidence,
+    config: VerdictConfig,
+    recording: Recording,
+    seen: Sequence[tuple[ImageU8, ...]] | None,
+    turns: Sequence[tuple[Array, Array]] = (),
 ) -> tuple[Evidence, Verdict]:
     """Return evidence and verdict; of a run that is not trusted with what contradicts its extrinsics.
 
-    They are the usual cause of a run that fails from its first frame on. `seen` is as for `contradicted_extrinsics`;
-    with None nothing is asked.
+    They are the usual cause of a run that fails from its first frame on. `seen` and `turns` are as for
+    `contradicted_extrinsics`; with None nothing is asked.
     """
     verdict = judge(evidence, config)
     if verdict.state is not Trust.TRUSTED and seen is not None:
-        evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen) + evidence.causes)
+        evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen, turns) + evidence.causes)
         verdict = judge(evidence, config)
     return evidence, verdict
