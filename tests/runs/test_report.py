@@ -331,7 +331,11 @@ def test_nothing_that_a_link_leads_to_is_in_a_report(copy, tmp_path_factory):
 
 def test_only_what_was_decoded_is_embedded(copy):
     image = cv2.imencode(".png", np.full((20, 30, 3), 90, np.uint8))[1].tobytes()
-    for name, data in (("picture_a.png", image + b"what is behind it"), ("picture_b.png", b"text"), ("c.webp", image)):
+    line = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (1, 400_000), np.uint8))[1].tobytes()
+    for name, data in (
+        ("picture_a.png", image + b"what is behind it"), ("picture_b.png", b"text"), ("c.webp", image),
+        ("picture_line.png", line),
+    ):  # fmt: skip
         (copy / "map" / name).write_bytes(data)
     text = write_report(copy).read_text()
     embedded = base64.b64decode(re.search(r'alt="a" src="data:image/png;base64,([^"]+)"', text)[1])
