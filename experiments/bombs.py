@@ -322,15 +322,13 @@ def _other_value(rng: np.random.Generator, value: Any) -> Any:
         out, at = bytearray(value), 8 * int(rng.integers(len(value) // 8 + 1))
         number = (float("nan"), float("inf"), 1e308, -1.0, 0.0, 1e-320, 5e17, 2.0)[int(rng.integers(8))]
         kind = int(rng.integers(5))
-        if kind == 0:
-            return bytes(out[: int(rng.integers(len(out)))])
-        if kind == 1:
-            return bytes(len(out) * int(10 ** rng.uniform(0, 3)))[: 2**21]
-        if kind == 2:
-            return bytes(out) * int(10 ** rng.uniform(0, 1.5))
-        out[at : at + 8] = (
-            struct.pack("<d", number) if kind == 3 else struct.pack("<q", int(10 ** rng.uniform(0, 18.9)))
-        )
+        if kind < 3:
+            is_image = value.startswith((b"\x89PNG", b"\xff\xd8"))
+            cut, zeros = int(rng.integers(len(out))), bytes(len(out) * int(10 ** rng.uniform(0, 3)))[: 2**21]
+            many = bytes(out) * int(10 ** rng.uniform(0, 1.5))
+            return forged_image(rng, value) if is_image else (bytes(out[:cut]), zeros, many)[kind]
+        whole = int(10 ** rng.uniform(0, 18.9))
+        out[at : at + 8] = struct.pack("<d", number) if kind == 3 else struct.pack("<q", whole)
         return bytes(out)
     if isinstance(value, str) and value.startswith(("{", "[")) and rng.random() < 0.8:
         return json_bomb(rng, value.encode()).decode()

@@ -3,6 +3,7 @@ import re
 import shutil
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from vislam.mapping.octree.octomap_io import read_octree
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.offline.rebuild import map_settings, rebuild
+from vislam.runs.report import write_report
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
 
@@ -79,6 +81,14 @@ def _write_config(run, config):
     with editing(run / "session.db") as db:
         db.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(data),))
     (run / "config.json").write_text(json.dumps(data))
+
+
+def test_stored_pictures_of_odd_shapes_are_reported_small(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    tall = cv2.imencode(".png", np.zeros((900_000, 1), np.uint8))[1].tobytes()
+    with editing(tmp_path / "run" / "session.db") as db:
+        db.execute("UPDATE scans SET colors = ?", (tall,))
+    assert write_report(tmp_path / "run").is_file()
 
 
 def test_poses_of_another_estimate(run, tmp_path):

@@ -54,7 +54,7 @@ class LoopGallery:
 
     def _keep(self, keyframe_id: int, image: ImageU8) -> None:
         scale = _WIDTH_PX / image.shape[1]
-        small = cv2.resize(image, (_WIDTH_PX, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(image, (_WIDTH_PX, max(round(image.shape[0] * scale), 1)), interpolation=cv2.INTER_AREA)
         jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])[1]
         self._thumbnails[keyframe_id] = (jpeg, scale)
         self._bytes += jpeg.nbytes

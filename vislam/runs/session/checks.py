@@ -85,7 +85,8 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
             for number, row in enumerate(db.execute(f"SELECT * FROM {table}")):
                 if not all(value is None or isinstance(value, kinds) for value, kinds in zip(row, stated, strict=True)):
                     raise DataError(
-                        f"session {path} is damaged: record {number} of {table} holds values of other types"
+                        f"session {path} is damaged: record {number} of {table} has values of other types; run the "
+                        "recording again"
                     )
                 count = len(row) - len(covered)
                 if checksums(table, row[:count]) != row[count:]:
