@@ -648,7 +648,10 @@ def _calibrations() -> list[dict[str, bytes]]:
     )
     vins = (
         b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 8\nimage_height: 6\ndistortion_parameters:\n   k1: 0.0\n"
-        b"projection_parameters:\n   " + lens % ((b"   ",) * 3) + b"td: 0.01\nextrinsicTranslation: [0, 0, 1]\n"
+        b"projection_parameters:\n   "
+        + lens % ((b"   ",) * 3)
+        + b"td: 0.01\nextrinsicTranslation: [0, 0, 1]\n"
+        + b"extrinsicRotation: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
     )
     basalt = (
         b'{"value0": {"T_imu_cam": [{"px": 0, "py": 0, "pz": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1}],'

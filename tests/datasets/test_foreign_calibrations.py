@@ -249,6 +249,7 @@ def test_vins_fusion_names_the_files_of_its_cameras(tmp_path: Path) -> None:
         (vins_lens("MEI").replace("xi", "x"), "looks like a file of VINS.*no 'xi'"),
         (vins_lens().replace("fx", "f"), "looks like a file of VINS.*no 'fx'"),
         (vins_lens() + matrix("body_T_lidar", T0), "not read: body_T_lidar"),
+        (vins_lens() + VINS[VINS.index("extrinsicT") :], "not read: extrinsicTranslation"),
         (orb("Omni", R4, RADTAN.coefficients, ""), "ORB-SLAM's camera model Omni is not supported"),
         (orb("PinHole", R4, RADTAN.coefficients, matrix("LEFT.K", T0)), "older settings with LEFT.K"),
         (orb("PinHole", R4, RADTAN.coefficients, "").replace("Camera.width: 64\n", ""), "ORB-SLAM.*no 'Camera.width'"),

@@ -175,7 +175,7 @@ def _vins(data: Keys, path: Path) -> list[CameraCalibration]:
     found = []
     if "model_type" in data:
         T = pose_in(data, "body_T_cam0", path)
-        if data.get("extrinsicRotation") is not None and data.get("extrinsicTranslation") is not None:
+        if "extrinsicRotation" in data and "extrinsicTranslation" in data:  # one alone is refused
             T = _of_two(data, "extrinsicRotation", "extrinsicTranslation", path)
         found.append(CameraCalibration(_vins_lens(data, path), T, time_offset_s=offset_s))
     else:
