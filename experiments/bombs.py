@@ -1,10 +1,14 @@
-"""Small files that ask for much, for `fuzz.py`: aliases, depth, packed zeros, forged sizes, damage at every level."""
+"""Small files that ask for much, for `fuzz.py`: aliases, depth, packed zeros, forged sizes, damage at every level.
+
+Of run folders: what is stored with its checksums put right, values of other types, links that lead elsewhere.
+"""
 
 from __future__ import annotations
 
 import bz2
 import importlib
 import io
+import json
 import re
 import sqlite3
 import struct
@@ -12,13 +16,23 @@ import sys
 import tempfile
 import zipfile
 import zlib
-from contextlib import closing
+from contextlib import closing, suppress
+from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import lz4.frame
 import numpy as np
 
 _MOST_UNPACKED = 2**26
+_ODD: tuple[Any, ...] = (
+    None, True, -1, 0, 1, 2**31, 2**62, 2**64, 10**30, 1e308, -1e-320, float("nan"), float("inf"), "", "nan",
+    "x" * 10**5, "../../etc/passwd", "\x1b[31m\u202e", [], {}, [[]], [0] * 10**4, {"": None}, {"a": {"a": {"a": 1}}},
+)  # fmt: skip
+
+
+class Link(bytes):
+    """What a link leads to, in the place of what a file holds."""
 
 
 def yaml_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
@@ -187,6 +201,139 @@ def forged_image(rng: np.random.Generator, sound: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in parts
     )
+
+
+def run_bomb(rng: np.random.Generator, sound: dict[str, bytes], outside: Path) -> dict[str, bytes]:
+    """Return the files of a run folder of which one to three lack, lead elsewhere, or hold something else."""
+    files = dict(sound)
+    for _ in range(int(rng.integers(1, 4))):
+        endings = sorted({Path(name).suffix for name in files})
+        ending = str(rng.choice(endings))
+        name = str(rng.choice(sorted(name for name in files if name.endswith(ending))))
+        kind, data = int(rng.integers(12)), files[name]
+        if isinstance(data, Link) or (kind == 0 and len(files) > 1):
+            del files[name]
+        elif kind == 1:
+            there = sorted(map(str, outside.iterdir()))
+            files[name] = Link(str(rng.choice([*there, "/dev/zero", "/proc/self/mem", ".", Path(name).name])).encode())
+        elif kind == 2:
+            files[f"{name}/x"] = files.pop(name)  # a folder of its name
+        elif kind == 3:
+            files[name] = data[: int(rng.integers(len(data) + 1))]
+        elif kind == 4:
+            files |= {"map": Link(str(outside).encode())}
+            files = {name: data for name, data in files.items() if not name.startswith("map/")}
+        else:
+            with suppress(ValueError, sqlite3.Error):  # what was cut short in an earlier round
+                files[name] = _stored_bomb(rng, ending, data)
+    return files
+
+
+def _stored_bomb(rng: np.random.Generator, ending: str, data: bytes) -> bytes:
+    if ending == ".json":
+        return json_bomb(rng, data)
+    if ending == ".db":
+        return session_bomb(rng, data)
+    if ending == ".yaml":
+        return yaml_bomb(rng, data)
+    if ending in (".jpg", ".png"):
+        return forged_image(rng, data)
+    return table_bomb(rng, data) if ending in (".csv", ".tum", ".txt") else forged_numbers(rng, data, 400)
+
+
+def json_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
+    """Return an object of which some values, at any depth, are of another type, very many, or no numbers."""
+    data = json.loads(sound)
+    for _ in range(int(10 ** rng.uniform(0, 1.5))):
+        at, key = data, None
+        while isinstance(at, dict | list) and at and (key is None or rng.random() < 0.8):
+            holder, key = at, (str(rng.choice(sorted(at))) if isinstance(at, dict) else int(rng.integers(len(at))))
+            at = at[key]
+        if key is not None:
+            holder[key] = deepcopy(_ODD[int(rng.integers(len(_ODD)))])
+    text = json.dumps(data)
+    depth = int(10 ** rng.uniform(0, 4.5))
+    return (
+        text.replace("null", ("[" * depth, "9" * depth)[int(rng.integers(2))], 1) if rng.random() < 0.1 else text
+    ).encode()
+
+
+def table_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
+    """Return a table of which fields or whole columns are something else, or that has very many rows."""
+    if rng.random() < 0.3:
+        return long_text(rng, sound)
+    separator = b"," if b"," in sound else b" "
+    rows = [line.split(separator) for line in sound.split(b"\n")]
+    odd = (
+        b"nan",
+        b"inf",
+        b"-1",
+        b"",
+        b"1e308",
+        b"9" * 30,
+        b"9" * 400,
+        b"x",
+        b"\xff",
+        b"True",
+        b"0.5",
+        b"9223372036854775807",
+    )
+    column = int(rng.integers(max(map(len, rows))))
+    whole, value = rng.random() < 0.5, odd[int(rng.integers(len(odd)))]
+    for row in rows[1:]:
+        if len(row) > column and (whole or rng.random() < 0.1):
+            row[column] = value
+    if rng.random() < 0.1:
+        rows = [row[:column] + row[column + 1 :] for row in rows]
+    return b"\n".join(separator.join(row) for row in rows)
+
+
+def session_bomb(rng: np.random.Generator, sound: bytes) -> bytes:
+    """Return a session of which some records are others, with checksums that are right for them."""
+    from vislam.runs.session.checks import checksums
+
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "session.db"
+        path.write_bytes(sound)
+        with closing(sqlite3.connect(path)) as db, db:
+            tables = [row[0] for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            tables = [table for table in tables if db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]]
+            table = str(rng.choice(tables))
+            columns = [row[1] for row in db.execute(f"PRAGMA table_info({table})")]
+            values = [column for column in columns if not column.startswith("crc")]
+            column, every = str(rng.choice(values)), int(10 ** rng.uniform(0, 1.7))
+            rows = db.execute(f"SELECT rowid, * FROM {table}").fetchall()
+            first = int(rng.integers(len(rows)))
+            for row in rows[first::every]:
+                changed = list(row[1:])
+                changed[columns.index(column)] = _other_value(rng, changed[columns.index(column)])
+                changed[len(values) :] = checksums(table, tuple(changed[: len(values)]))
+                with suppress(sqlite3.Error, OverflowError):
+                    places = ", ".join(f"{one} = ?" for one in columns)
+                    db.execute(f"UPDATE {table} SET {places} WHERE rowid = ?", (*changed, row[0]))
+            if rng.random() < 0.15:
+                db.execute(f"DELETE FROM {table} WHERE rowid % {every + 1} = 0")
+        return path.read_bytes()
+
+
+def _other_value(rng: np.random.Generator, value: Any) -> Any:
+    """Return something else for a value of a database, of its type or not."""
+    if isinstance(value, bytes) and value and rng.random() < 0.8:
+        out, at = bytearray(value), 8 * int(rng.integers(len(value) // 8 + 1))
+        number = (float("nan"), float("inf"), 1e308, -1.0, 0.0, 1e-320, 5e17, 2.0)[int(rng.integers(8))]
+        kind = int(rng.integers(5))
+        if kind < 3:
+            is_image = value.startswith((b"\x89PNG", b"\xff\xd8"))
+            cut, zeros = int(rng.integers(len(out))), bytes(len(out) * int(10 ** rng.uniform(0, 3)))[: 2**21]
+            many = bytes(out) * int(10 ** rng.uniform(0, 1.5))
+            return forged_image(rng, value) if is_image else (bytes(out[:cut]), zeros, many)[kind]
+        whole = int(10 ** rng.uniform(0, 18.9))
+        out[at : at + 8] = struct.pack("<d", number) if kind == 3 else struct.pack("<q", whole)
+        return bytes(out)
+    if isinstance(value, str) and value.startswith(("{", "[")) and rng.random() < 0.8:
+        return json_bomb(rng, value.encode()).decode()
+    odd = _ODD[int(rng.integers(len(_ODD)))]
+    return bytes(1000) if isinstance(odd, list | dict) else odd
 
 
 def _ros_record(fields: list[bytes], data: bytes) -> bytes:

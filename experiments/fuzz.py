@@ -16,6 +16,7 @@ import json
 import os
 import resource
 import select
+import shutil
 import signal
 import sqlite3
 import sys
@@ -25,8 +26,9 @@ import traceback
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, redirect_stderr, redirect_stdout
+from contextlib import closing, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +38,8 @@ import numpy as np
 
 from vislam.core.errors import VislamError, printable
 
+_SECRET = b"CANARY" * 100
+_TRACES = (b"CANARY", b"Q0FOQVJZ")  # as it is, and in base64
 LIMIT_S = 10.0  # of the processor's time
 FREE_BYTES, TIMES = 300 * 2**20, 10
 _MOST_BYTES = 4 * 2**20  # of a mutated file
@@ -135,12 +139,12 @@ def case(target: Target, number: int, seed: int, folder: Path) -> int:
 
 def write(folder: Path, files: dict[str, bytes]) -> None:
     """Make a folder hold these files and nothing else."""
-    for path in sorted(folder.rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
+    for path in list(folder.iterdir()):
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        path.symlink_to(data.decode()) if isinstance(data, bombs.Link) else path.write_bytes(data)
 
 
 def outcome(target: Target, folder: Path, size: int) -> Answer:
@@ -202,6 +206,7 @@ def run_cases(
                 os.close(reader)
                 _work(map(named, range(at, end)), seed, Path(scratch), writer, until)
             os.close(writer)
+            answer: Answer | None = Answer("read", "", 0.0, 0)
             for answer in _answers(reader):
                 _count(tallies, *named(at), answer or Answer("HANG", "killed", LIMIT_S, 0), seed, keep)
                 at += 1
@@ -210,8 +215,9 @@ def run_cases(
                     break
             os.close(reader)
             _, status = os.waitpid(child, 0)
-            if os.WIFSIGNALED(status) and os.WTERMSIG(status) != signal.SIGKILL and at < end:
-                _count(tallies, *named(at), Answer("CRASH", f"signal {os.WTERMSIG(status)}", 0.0, 0), seed, keep)
+            if status and answer is not None and at < end:  # and was not killed here
+                how = f"ended with {os.waitstatus_to_exitcode(status)}"
+                _count(tallies, *named(at), Answer("CRASH", how, 0.0, 0), seed, keep)
                 at += 1
     return tallies
 
@@ -341,25 +347,74 @@ def bomb_targets() -> list[Target]:
     ]
 
 
-def run_target(folder: Path) -> list[Target]:
-    """Return the targets that need a run folder, which is made here."""
-    from vislam.cli import run_verb
+def run_targets(folder: Path) -> list[Target]:
+    """Return the targets that need run folders, which are made here: of points, and of a room with a map."""
     from vislam.runs.session import SessionWriter
 
-    source = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=60"
+    tracks = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=60"
+    _made(folder / "points", tracks, "--map.products")
+    _made(folder / "room", "sim:handheld-room,rig=rgbd,duration_s=4,camera_hz=6,image_width_px=160")
+    SessionWriter.reopen(folder / "points" / "session.db").close()  # which drops frames behind the last keyframe
+    points, room = _files(folder / "points"), _files(folder / "room")
+    outside = folder / "outside"
+    outside.mkdir()
+    (outside / "secret.txt").write_bytes(_SECRET)
+    for name in ("session.db", "trajectory_graph.tum", "config.json"):
+        (outside / name).write_bytes(points[name])
+    whole = _dump(folder / "points" / "session.db")
+    short = tracks.replace("duration_s=8", "duration_s=2")
+    verbs: dict[str, list[list[str]]] = {
+        "read": [["eval", "RUN"], ["eval", "RUN", "--loops"], ["loops", "RUN"], ["report", "RUN"]],
+        "optimize": [["optimize", "RUN", "--no-report", "--rounds", "1"], ["loops", "RUN", "--undo", "0"]],
+        "join": [["optimize", "RUN", str(folder / "points"), "--out", "OUT", "--no-report"]],
+        "export": [["export", "RUN", "--mcap", "OUT.mcap", "--colmap", "OUT", "--splats", "OUT.ply"]],
+        "rebuild": [["map", "RUN", "--products", "cloud", "octomap"], ["map", "RUN", "--out", "OUT", "--poses", "ekf"]],
+        "resume": [["run", "--resume", "RUN"]],
+        "begin in": [["run", short, "--map", "RUN", "--out", "OUT", "--view.no-enabled", "--map.no-enabled"]],
+    }
+    return [
+        Target("run folder", [points], _read_run, 1),
+        Target("stored bomb", [points, room], _read_stored, made=partial(bombs.run_bomb, outside=outside)),
+        Target("session", [{"session.db": points["session.db"]}], lambda at: _read_session(at, whole)),
+        *(
+            Target(
+                f"{name} bomb", [room if name in ("export", "rebuild") else points],
+                partial(_work_on, lines, outside, _files(outside)), 2,
+                made=partial(bombs.run_bomb, outside=outside),
+            )
+            for name, lines in verbs.items()
+        ),
+    ]  # fmt: skip
+
+
+def _made(folder: Path, source: str, *more: str) -> None:
+    from vislam.cli import run_verb
+
     with open(os.devnull, "w", encoding="utf-8") as null, redirect_stdout(null):
-        code = run_verb(["run", source, "--out", str(folder), "--view.no-enabled", "--json", "--map.products"])
+        code = run_verb(["run", source, "--out", str(folder), "--view.no-enabled", "--json", *more])
     if code:
         raise SystemExit(f"no run folder could be made: exit code {code}")
-    names = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.suffix in (".json", ".csv", ".tum", ".db")]
-    files = {str(p.relative_to(folder)): p.read_bytes() for p in names}
-    session = {"session.db": files.pop("session.db")}
-    SessionWriter.reopen(folder / "session.db").close()  # which drops frames behind the last keyframe
-    whole = _dump(folder / "session.db")
-    return [
-        Target("run folder", [files | session], _read_run, 1),
-        Target("session", [session], lambda at: _read_session(at, whole)),
-    ]
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    large = (".html", ".png", ".rrd")
+    names = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix not in large]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in names}
+
+
+def _work_on(lines: list[list[str]], outside: Path, held: dict[str, bytes], folder: Path) -> None:
+    """Run command lines on a run folder, which must leave what lies elsewhere as it is and to itself."""
+    out = folder.parent / f"{folder.name}-out"
+    for line in lines:
+        for path in folder.parent.glob(f"{out.name}*"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _verb(*(word.replace("RUN", str(folder)).replace("OUT", str(out)) for word in line))
+    if _files(outside) != held:
+        write(outside, held)
+        raise AssertionError("what lies outside of the folder was written to")
+    for path in (*folder.rglob("*"), *out.rglob("*")):
+        if path.is_file() and not path.is_symlink() and any(part in path.read_bytes() for part in _TRACES):
+            raise AssertionError(f"{path.name} holds what lies outside of the folder")
 
 
 def _verb(*arguments: str) -> None:
@@ -593,7 +648,10 @@ def _calibrations() -> list[dict[str, bytes]]:
     )
     vins = (
         b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 8\nimage_height: 6\ndistortion_parameters:\n   k1: 0.0\n"
-        b"projection_parameters:\n   " + lens % ((b"   ",) * 3) + b"td: 0.01\nextrinsicTranslation: [0, 0, 1]\n"
+        b"projection_parameters:\n   "
+        + lens % ((b"   ",) * 3)
+        + b"td: 0.01\nextrinsicTranslation: [0, 0, 1]\n"
+        + b"extrinsicRotation: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
     )
     basalt = (
         b'{"value0": {"T_imu_cam": [{"px": 0, "py": 0, "pz": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1}],'
@@ -684,7 +742,6 @@ def _read_tracks(folder: Path) -> None:
 
 
 def _maps() -> list[dict[str, bytes]]:
-    from vislam.mapping.formats.pcd import write_pcd
     from vislam.mapping.formats.ply import write_ply
     from vislam.mapping.octree.octomap_io import encode_bt, encode_ot
     from vislam.mapping.octree.tree import OctreeLeaves
@@ -697,18 +754,16 @@ def _maps() -> list[dict[str, bytes]]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_ply(folder / "a.ply", points, colors)
-        write_pcd(folder / "a.pcd", points, colors)
         written = [{path.name: path.read_bytes()} for path in sorted(folder.iterdir())]
     return [{"a.bt": encode_bt(octree)}, {"a.ot": encode_ot(octree)}, *written]
 
 
 def _read_maps(folder: Path) -> None:
-    from vislam.mapping.formats.pcd import read_pcd
     from vislam.mapping.formats.ply import read_ply
     from vislam.mapping.octree.octomap_io import read_octree
 
     for path in folder.iterdir():
-        read: Callable[[Path], object] = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix, read_octree)
+        read: Callable[[Path], object] = read_ply if path.suffix == ".ply" else read_octree
         read(path)
 
 
@@ -772,6 +827,29 @@ def _read_run(folder: Path) -> None:
     read_setup(folder)
 
 
+def _read_stored(folder: Path) -> None:
+    """Read what a run left by the functions that verbs call, each for itself."""
+    from vislam.runs.folder import read_setup
+    from vislam.runs.loaded import load_run
+    from vislam.runs.offline.evaluated import read_evaluated
+    from vislam.runs.report.run_files import read_run
+    from vislam.runs.session import Session, recall
+
+    def session(folder: Path) -> None:
+        with closing(Session(folder / "session.db")) as stored:
+            recall(stored)
+            stored.factor_log()
+            stored.config()
+            for many in (stored.keyframes(), stored.edges(), stored.scans(), stored.shifts(), stored.retrieved()):
+                for _ in many:
+                    pass
+
+    readers: tuple[Callable[[Path], object], ...] = (load_run, read_setup, read_evaluated, read_run, session)
+    for read in readers:
+        with suppress(VislamError):
+            read(folder)
+
+
 def _read_session(folder: Path, whole: list[str]) -> None:
     from vislam.runs.session import Session, SessionWriter, has_begun, recall
 
@@ -809,8 +887,8 @@ def main() -> int:
         targets = small_targets()
         if options.hostile is not None:
             targets.append(hostile_target(options.hostile))
-        if not options.only or {"run folder", "session"} & set(options.only):
-            targets += run_target(Path(name) / "run")
+        if not options.only or not {target.name for target in targets} >= set(options.only):
+            targets += run_targets(Path(name))
         targets = [target for target in targets if not options.only or target.name in options.only]
         refused = refused_seeds(targets)
         until = time.monotonic() + 60.0 * options.minutes

@@ -21,6 +21,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ from vislam.config import LoopTruthConfig
 from vislam.core.errors import VislamError
 from vislam.core.files import write_json, write_text
 from vislam.core.messages import Array, Frame, Keyframe, LoopCandidate
-from vislam.loop import LoopCloser, LoopRow, loops_text, retrieved_text
-from vislam.runs.offline.loop_evaluation import JudgedLoops, judge_loops, pooled, summarise
+from vislam.loop import Detections, LoopCloser, LoopRow, loops_text, retrieved_text
+from vislam.runs.offline.loop_evaluation import JudgedLoops, judge_loops, summarise
 from vislam.runs.report import write_loop_plot
 from vislam.runs.session import Session
 
@@ -40,6 +41,25 @@ WORLDS = ("workshop-cart", "corridor-loop", "aliased-halls")
 _START = "from vislam.cli import main; main()"
 _QUIET = ("--map.no-enabled", "--view.no-enabled", "--overwrite")
 _TIMEOUT_S = 3600.0
+
+
+def pooled(runs: Sequence[JudgedLoops]) -> JudgedLoops:
+    """Return several runs as one: their keyframes after each other."""
+    stages = {
+        name: Detections(
+            np.concatenate([run.stages[name].score for run in runs]),
+            np.concatenate([run.stages[name].verdict for run in runs]),
+        )
+        for name in runs[0].stages
+    }
+    sources = sorted({source for run in runs for source in run.proposals})
+    proposals = {}
+    for source in sources:
+        each = [run.proposals.get(source, (0, 0)) for run in runs]
+        proposals[source] = (sum(count for count, _ in each), sum(near for _, near in each))
+    found = {step: sum(run.found[step] for run in runs) for step in runs[0].found}
+    edges = [edge for run in runs for edge in run.edges]
+    return JudgedLoops(np.concatenate([run.revisits for run in runs]), stages, edges, proposals, found)
 
 
 def main() -> None:

@@ -21,7 +21,6 @@ from vislam.experiment.plan import load_plan
 from vislam.loop.table import read_loops
 from vislam.loop.words.orbslam import read_orbslam
 from vislam.loop.words.vocabulary import Vocabulary
-from vislam.mapping.formats.pcd import read_pcd
 from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.octree.octomap_io import read_octree
 from vislam.runs.folder import read_metrics
@@ -94,7 +93,7 @@ def test_what_is_quoted_never_reaches_the_terminal_as_it_is():
 
 
 READERS = (
-    read_trajectory, load_yaml, load, load_plan, read_orbslam, Vocabulary.load, read_octree, read_pcd, read_ply,
+    read_trajectory, load_yaml, load, load_plan, read_orbslam, Vocabulary.load, read_octree, read_ply,
     read_loops, Session, read_tracks,
 )  # fmt: skip
 

@@ -433,8 +433,10 @@ def test_a_bag_without_images_is_what_it_is(tmp_path: Path) -> None:
     types = types_of("mcap")
     poses = [Message(BEGIN_NS + i, "/vicon", types.pose_stamped(BEGIN_NS + i, [i, 0, 1])) for i in range(5)]
     path = write_bag(tmp_path, "mcap", poses)
-    errors = [f.what for f in inspect(str(path)).findings if f.severity == "error"]
-    assert len(errors) == 1
+    report = inspect(str(path))
+    errors = [f.what for f in report.findings if f.severity == "error"]
+    assert len(errors) == 1 and not any("vision" in finding.what for finding in report.findings)
+    assert [topic.taken_for for topic in report.topics] == ["not used; poses, for truth=/vicon"]
     assert f"there are /vicon; its poses can be evaluated: vislam eval {path} --topic /vicon" in errors[0]
     with pytest.raises(DataError, match="no camera images that can be read; there are /vicon"):
         open_dataset(str(path))

@@ -101,6 +101,8 @@ def test_a_film_has_its_tables_beside_it(tmp_path):
     write(tmp_path / "gyro_test.accel.csv", "", euroc_row, ACCEL_NS, force(ACCEL_NS))
     rows = list(survey(str(tmp_path / "gyro_test.mp4")).imu_rows(Problems()))
     np.testing.assert_allclose([row for _, row in rows], np.hstack([rate(GYRO_NS), force(GYRO_NS)]), atol=1e-7)
+    (tmp_path / "gyro_test_timestamps.csv").write_text("7\n8\n")  # as OpenCamera Sensors has it
+    assert survey(str(tmp_path / "gyro_test.mp4")).cameras[0].t_ns.tolist() == [7, 8]
 
 
 @pytest.mark.parametrize(

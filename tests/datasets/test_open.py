@@ -69,6 +69,8 @@ def test_a_pointer_of_git_lfs_is_named_as_one(tmp_path: Path) -> None:
         (tmp_path / name).write_text(pointer)
         with pytest.raises(DataError, match=f"{name} cannot be read: a Git LFS pointer.*git lfs pull"):
             open_dataset(f"bag:{tmp_path / name}")
+    (tmp_path / "ride.mp4").write_text(pointer)
+    assert any("ride.mp4 cannot be read: a Git LFS" in f.what for f in inspect(str(tmp_path / "ride.mp4")).findings)
     for image in (mav0 / "cam0" / "data").iterdir():
         image.write_text(pointer)
     assert any("Git LFS pointer" in f.what for f in inspect(str(mav0)).findings)

@@ -134,11 +134,14 @@ def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: py
     with emulated_bus(bus), closing(FifoBoard(config, clock, named="mpu6050-clone")) as board:
         findings = check_board(board, *_listen(board, 1.0, clock), path)
     good = "\n".join(f.what for f in findings if f.severity == "ok")
-    assert "MPU-6050 clone 0x98 passes its self-test: a clone, taken for an MPU-6500; gravity is 9.8" in good
+    assert "MPU-6050 clone 0x98 passes its self-test: a clone, taken for an MPU-6500; its gyroscope's" in good
+    assert "scale shows in `vislam calibrate imu`; gravity is 9.8" in good
     assert "gravity is measured as 9.8" in good
 
 
-@pytest.mark.parametrize(("gravity", "outcome"), [(4.9, "refused"), (19.6, "refused"), (9.81, "ok"), (None, "moves")])
+@pytest.mark.parametrize(
+    ("gravity", "outcome"), [(4.9, "refused"), (19.6, "refused"), (0.0, "refused"), (9.81, "ok"), (None, "moves")]
+)
 def test_gravity_decides_whether_the_scale_of_a_clone_fits(
     gravity: float | None, outcome: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import time
 import uuid
+from collections.abc import Callable
 from itertools import count, islice
 from multiprocessing import get_context
 from pathlib import Path
@@ -246,7 +247,7 @@ def test_a_reader_never_sees_half_of_two_values() -> None:
     assert not Path(f"/dev/shm/{name}").exists()
 
 
-def test_memory_and_sockets_belong_to_their_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_and_sockets_belong_to_their_user(tmp_path: Path) -> None:
     name, at = f"vislam-test-{uuid.uuid4().hex}", tmp_path / "a.sock"
     writer, listener = SlotWriter(name, 8), PoseListener(f"unix:{at}")
     try:
@@ -255,11 +256,6 @@ def test_memory_and_sockets_belong_to_their_user(tmp_path: Path, monkeypatch: py
         assert stat.S_IMODE(at.stat().st_mode) == 0o600
         writer.write(b"mine")
         assert SlotReader(name).read() == (1, b"mine")
-        if os.geteuid() == 0:
-            os.chown(path, 54321, -1)
-        monkeypatch.setattr(os, "geteuid", lambda: 12345)
-        with pytest.raises(DataError, match="is that of user"):
-            SlotReader(name)
     finally:
         writer.close()
         listener.close()
@@ -295,6 +291,52 @@ def test_a_group_that_is_named_may_read_and_an_owner_who_is_named_is_read(
     with pytest.raises(UsageError, match="no user no-such-user"):
         PoseReader(name, "no-such-user")
     assert not at.exists() and not [left for left in Path("/dev/shm").iterdir() if name in left.name]
+
+
+def said_as(user: str, groups: list[int], act: Callable[[], str]) -> str:
+    """Return what is said in a process of another user, errors too."""
+    reader, writer = os.pipe()
+    if not (child := os.fork()):
+        try:
+            os.setgroups(groups)
+            os.setuid(pwd.getpwnam(user).pw_uid)
+            said = act()
+        except BaseException as error:
+            said = str(error)
+        os.write(writer, said.encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    os.close(writer)
+    with open(reader) as file:
+        return file.read()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root becomes other users")
+def test_other_users_read_by_their_group_or_not_and_cannot_be_first() -> None:
+    name, group = f"vislam-test-{uuid.uuid4().hex}", grp.getgrnam("users")
+    path = Path(f"/dev/shm/{name}")
+
+    def write() -> str:
+        SlotWriter(name, 8, group.gr_name).write(b"ours")
+        return "written"
+
+    def read() -> str:
+        return str(SlotReader(name, "nobody").read())
+
+    try:
+        assert said_as("bin", [], lambda: str(path.write_bytes(bytes(40)))) == "40"
+        assert "cannot be made: Operation not permitted" in said_as("nobody", [group.gr_gid], write)
+        assert "is that of user" in said_as("daemon", [group.gr_gid], read)
+        path.unlink()
+        assert said_as("nobody", [group.gr_gid], write) == "written"
+        assert said_as("daemon", [group.gr_gid], read) == "(1, b'ours')"
+        assert "another user's" in said_as("bin", [], read)
+        path.rename(other := path.with_name(f"{name}-other"))
+        assert said_as("bin", [], lambda: str(path.symlink_to(other))) == "None"
+        assert "there is no shared memory" in said_as("daemon", [group.gr_gid], read)
+    finally:
+        for left in path.parent.glob(f"{name}*"):
+            left.unlink()
 
 
 def test_poses_are_not_sent_to_who_was_first_at_a_name_in_tmp(monkeypatch: pytest.MonkeyPatch) -> None:

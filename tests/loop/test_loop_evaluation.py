@@ -37,7 +37,7 @@ from vislam.loop.evaluation import (
 )
 from vislam.loop.table import LoopRow, loops_text, read_loops, read_retrieved, retrieved_text
 from vislam.loop.words import Vocabulary, seed_vocabulary
-from vislam.runs.offline.loop_evaluation import evaluate_loops, judge_loops, pooled, summarise
+from vislam.runs.offline.loop_evaluation import evaluate_loops, judge_loops
 from vislam.runs.session import Session, SessionWriter
 from vislam.trajectory import Trajectory, read_tum, write_tum
 from worlds.landmarks import LandmarkWorld, lap_poses, room
@@ -320,16 +320,6 @@ def test_what_is_missing_is_named(finished: Path, tmp_path: Path) -> None:
     write_tum(late, tmp_path / "trajectory_truth.tum")
     with pytest.raises(DataError, match="covers none of"):
         evaluate_loops(tmp_path, RULE)
-
-
-def test_pooled_runs_are_their_keyframes_after_each_other(finished: Path) -> None:
-    one = judge_loops(finished, RULE)
-    alone, twice = summarise(one, RULE), summarise(pooled([one, one]), RULE)
-    assert twice["revisits"] == 2 * alone["revisits"]
-    assert twice["edges"]["accepted"] == 2 * alone["edges"]["accepted"]
-    for name, stage in twice["stages"].items():
-        assert stage["wrong"] == 2 * alone["stages"][name]["wrong"]
-        assert stage["recall_at_full_precision"] == alone["stages"][name]["recall_at_full_precision"]
 
 
 def test_the_experiment_writes_what_came_out_and_what_failed(

@@ -1,7 +1,9 @@
 import json
+import re
 import shutil
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,12 +12,12 @@ from vislam.cli import run_verb
 from vislam.config import Config, ImuConfig, MapConfig, ViewConfig
 from vislam.core.errors import DataError, UsageError
 from vislam.datasets.recorder import record
-from vislam.mapping.formats.pcd import read_pcd
 from vislam.mapping.formats.ply import read_ply
 from vislam.mapping.octree.octomap_io import read_octree
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.offline.rebuild import map_settings, rebuild
+from vislam.runs.report import write_report
 from vislam.runs.sources import open_source
 from vislam.sim import open_world
 
@@ -57,7 +59,8 @@ def test_another_resolution_and_other_products(run, tmp_path):
     answer = rebuild(run, config, tmp_path, "graph")
     assert set(answer["written"]) == {"pcd", "octomap", "surfels"}
     assert read_octree(tmp_path / "octomap.bt").resolution_m == 0.1
-    assert 0 < len(read_pcd(tmp_path / "cloud.pcd")[0]) < len(read_ply(run / "map" / "cloud.ply")[0])
+    points = int(re.search(rb"POINTS (\d+)", (tmp_path / "cloud.pcd").read_bytes())[1])
+    assert 0 < points < len(read_ply(run / "map" / "cloud.ply")[0])
 
 
 def test_other_filters_read_the_recording_again(run, tmp_path):
@@ -78,6 +81,14 @@ def _write_config(run, config):
     with editing(run / "session.db") as db:
         db.execute("UPDATE info SET value = ? WHERE key = 'config'", (json.dumps(data),))
     (run / "config.json").write_text(json.dumps(data))
+
+
+def test_stored_pictures_of_odd_shapes_are_reported_small(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    tall = cv2.imencode(".png", np.zeros((900_000, 1), np.uint8))[1].tobytes()
+    with editing(tmp_path / "run" / "session.db") as db:
+        db.execute("UPDATE scans SET colors = ?", (tall,))
+    assert write_report(tmp_path / "run").is_file()
 
 
 def test_poses_of_another_estimate(run, tmp_path):

@@ -50,6 +50,7 @@ def test_a_run_of_which_nothing_is_known_is_not_doubted():
         ({"frames_lost": 60, "lost_reason": "N of N"}, "at once, mostly because N of N"),
         ({"frames": 20, "frames_lost": 8}, "vision lost 8 of 20 frames"),
         ({"events": ("imu0: stuck at one value from 4.00 to 9.00 s",)}, "imu0: stuck at one value from 4.00 to 9.00 s"),
+        ({"events": ("imu0: another motion than the camera sees",)}, "axes (T_BS, or its inverse), cable"),
         ({"is_confirmed": False}, "the start was not confirmed"),
         ({"scale_sigma": 0.08}, "one camera's metres are known to 8.0 % (1 sigma) only"),
         ({"frames_degraded": 150}, "vision was weak in 150 of 400 frames"),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from run_folder import DEGRADED, LOST, make_run
+from vislam.cli import run_verb
 from vislam.core.errors import DataError, StorageError
 from vislam.core.memory import GraphRecord, KeyframeEntry, PackedScan
 from vislam.core.messages import GraphUpdate
@@ -329,9 +330,25 @@ def test_nothing_that_a_link_leads_to_is_in_a_report(copy, tmp_path_factory):
     assert text.count("is a link that leads out of the run folder") == 2
 
 
+@pytest.mark.parametrize("link", ["log.txt", "map"])
+@pytest.mark.parametrize("verb", [["loops", "--undo", "0"], ["optimize"]])
+def test_nothing_is_written_to_where_a_link_leads(copy, verb, link, tmp_path_factory, capsys):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "kept").write_text("as it was")
+    shutil.rmtree(copy / "map")
+    (copy / link).symlink_to(elsewhere if link == "map" else elsewhere / "kept")
+    assert run_verb([verb[0], str(copy), *verb[1:]]) == 3
+    assert f"{link} is a link that leads out of the run folder" in capsys.readouterr().err
+    assert [(path.name, path.read_text()) for path in elsewhere.iterdir()] == [("kept", "as it was")]
+
+
 def test_only_what_was_decoded_is_embedded(copy):
     image = cv2.imencode(".png", np.full((20, 30, 3), 90, np.uint8))[1].tobytes()
-    for name, data in (("picture_a.png", image + b"what is behind it"), ("picture_b.png", b"text"), ("c.webp", image)):
+    line = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (1, 400_000), np.uint8))[1].tobytes()
+    for name, data in (
+        ("picture_a.png", image + b"what is behind it"), ("picture_b.png", b"text"), ("c.webp", image),
+        ("picture_line.png", line),
+    ):  # fmt: skip
         (copy / "map" / name).write_bytes(data)
     text = write_report(copy).read_text()
     embedded = base64.b64decode(re.search(r'alt="a" src="data:image/png;base64,([^"]+)"', text)[1])

@@ -297,7 +297,9 @@ def test_a_full_disk_ends_with_a_storage_error_and_keeps_what_was_written(record
     assert (out / "manifest.json").is_file()
 
 
-def test_an_interrupt_keeps_what_was_computed(small_room, tmp_path):
+def test_an_interrupt_keeps_what_was_computed_and_asks_no_more_of_the_images(small_room, tmp_path, monkeypatch):
+    monkeypatch.setattr("vislam.runs.evidence.contradicted_extrinsics", lambda *_: pytest.fail("asked"))
+
     def interrupted(events):
         for n, value in enumerate(events):
             if n == 1200:
@@ -305,9 +307,9 @@ def test_an_interrupt_keeps_what_was_computed(small_room, tmp_path):
             yield value
 
     with pytest.raises(KeyboardInterrupt):
-        run(Edited(small_room, interrupted), tmp_path / "run", map__enabled=False)
+        run(Edited(small_room, interrupted), tmp_path / "run", map__enabled=False, verdict__probability=0.01)
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["frames"] > 40
+    assert metrics["frames"] > 40 and metrics["verdict"]["state"] == "doubtful"
     assert "stopped early" in metrics["warnings"][0]
 
 

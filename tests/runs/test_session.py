@@ -251,6 +251,7 @@ def test_damage_and_strangers_are_refused(tmp_path):
         "UPDATE packets SET track_ids = x'001122' WHERE id = 1",
         "UPDATE further SET pixels_px = x'00112233' WHERE id = 1",
         "UPDATE further SET id = 7 WHERE id = 1",
+        "UPDATE packets SET vo_inliers = 'many' WHERE id = 1",
         "UPDATE packets SET imu_gyro = NULL WHERE id = 1",
         "UPDATE packets SET vo_tracking = 'fine' WHERE id = 1",
         "UPDATE edges SET covariance = x'' WHERE id = 5",
@@ -270,6 +271,14 @@ def test_a_damaged_factor_log_is_a_data_error(damage, tmp_path):
         database.execute(damage)
     with pytest.raises(DataError, match="run the recording again"):
         Session(tmp_path / "session.db").factor_log()
+
+
+def test_scores_that_were_no_numbers_are_read_as_such(tmp_path):
+    write_three(tmp_path / "session.db")[0].close()
+    with editing(tmp_path / "session.db") as database:
+        database.execute("INSERT INTO retrieved VALUES (9, 2, 0, NULL, NULL, 1, 0)")
+    with closing(Session(tmp_path / "session.db")) as session:
+        assert np.isnan([session.retrieved()[-1].score, session.retrieved()[-1].island_score]).all()
 
 
 @pytest.mark.parametrize(

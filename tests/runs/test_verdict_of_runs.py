@@ -9,6 +9,7 @@ from faults.sensor_faults import FAULTS, FaultyRecording
 from vislam.cli.verbs.results import print_metrics
 from vislam.config import Config, load
 from vislam.core.errors import UsageError, VislamError
+from vislam.core.geometry import invert
 from vislam.core.messages import Frame
 from vislam.core.streams import Happening, StreamEvent
 from vislam.pipeline.front_report import FrontReport
@@ -83,6 +84,17 @@ def test_swapped_cameras_are_no_trusted_run(tmp_path):
     with pytest.raises(VislamError):
         run(tmp_path / "run", "swapped")
     assert json.loads((tmp_path / "run/metrics.json").read_text())["verdict"]["state"] == "lost"
+
+
+def test_the_inverse_of_the_extrinsics_is_named_where_nothing_is_on_disk(tmp_path):
+    recording = open_source("points:handheld-room,rig=stereo,duration_s=7,camera_hz=10,tracks=80")
+    config = load(None, {"view.enabled": False, "map.enabled": False})
+    to_cam = invert(recording.rig.T_body_cams[0])
+    recording.rig = replace(recording.rig, T_body_cams=tuple(to_cam @ to_cam @ T for T in recording.rig.T_body_cams))
+    prepare(tmp_path / "run", overwrite=False)
+    reasons = execute(recording, config, tmp_path / "run", "", [])["verdict"]["reasons"]
+    assert "turns seen by cam0 and by the gyro differ by" in reasons[0]
+    assert "write the inverse of its pose" in reasons[0] and "axes (T_BS, or its inverse)" in reasons[1]
 
 
 def test_a_short_rest_of_one_camera_whose_samples_begin_after_it_has_poses(tmp_path):

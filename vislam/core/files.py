@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from vislam.core.errors import StorageError
+from vislam.core.errors import DataError, StorageError
 
 _LINES_AT_ONCE = 4096
 
@@ -87,6 +87,18 @@ def plain(data: Any) -> Any:
     if isinstance(data, (float, np.floating)):
         return float(data) if np.isfinite(data) else None
     return data.item() if isinstance(data, np.generic) else data
+
+
+def leads_out(path: Path, folder: Path) -> bool:
+    """Return whether a path in a folder is a link that leads out of it, or lies behind one."""
+    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+def refuse_links_out(run: Path) -> None:
+    """Raise DataError for a link that leads out of a run folder: what is written there would be written elsewhere."""
+    for path in (*run.glob("*"), *run.glob("*/*")):
+        if path.is_symlink() and leads_out(path, run):
+            raise DataError(f"{path} is a link that leads out of the run folder; put there what it leads to")
 
 
 def check_writable(out: Path) -> None:

@@ -14,6 +14,7 @@ from logging.handlers import QueueHandler
 from pathlib import Path
 
 from vislam.core.errors import UsageError, VislamError, storage_failure
+from vislam.core.files import refuse_links_out
 from vislam.core.revision import version
 
 FILE_NAME = "log.txt"
@@ -60,7 +61,11 @@ def log_to(folder: Path, command: Sequence[str]) -> Iterator[None]:
 
 
 def log_in_run(run: Path, command: Sequence[str]) -> AbstractContextManager[None]:
-    """Return `log_to` for a run that is there, and nothing for a folder that holds none."""
+    """Return `log_to` for a run that is there, and nothing for a folder that holds none.
+
+    Raises DataError for links that lead out of it.
+    """
+    refuse_links_out(run)
     return log_to(run, command) if (run / "manifest.json").is_file() else nullcontext()
 
 

@@ -201,11 +201,16 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
 
 
 def pose_in(data: Mapping[str, Any], key: str, path: Path) -> Array | None:
-    """Return a pose [4, 4] of a file, None when it has none; raises DataError unless it is rigid."""
+    """Return a pose [4, 4] of a file, also of its first three rows; None when it has none.
+
+    Raises DataError unless it is rigid.
+    """
     if data.get(key) is None:
         return None
-    T = np.array(numbers_in(data, key, path, 16)).reshape(4, 4)
-    if not are_rotations(T[:3, :3], 1e-3):
+    numbers = numbers_in(data, key, path)
+    numbers += [0.0, 0.0, 0.0, 1.0] * (len(numbers) == 12)
+    T = np.array(numbers_in({key: numbers}, key, path, 16)).reshape(4, 4)
+    if not are_rotations(T[:3, :3], 1e-3) or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
     return T
 

@@ -7,12 +7,13 @@ from contextlib import closing
 
 import numpy as np
 
+from vislam.core.angles import angles_of
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
-from vislam.core.messages import ImageU8
+from vislam.core.messages import Array, ImageU8
 from vislam.core.recording import Problems, Recording, Wrapping
-from vislam.datasets.camera_turns import follow_turns, judged_turns, turn_places
+from vislam.datasets.camera_turns import TurnFit, follow_turns, judged_turns, turn_findings, turn_places
 from vislam.datasets.loaders import FrameTable
 from vislam.datasets.plausibility import ImuFacts, imu_facts
 from vislam.datasets.rgbd import MEND, misplaced, misplaced_words
@@ -20,7 +21,7 @@ from vislam.datasets.rig_checks import judged_cameras
 from vislam.datasets.stream import FileRecording, Survey, open_loader
 from vislam.datasets.tables import Row
 
-_CHECKED_FRAMES = 6
+_CHECKED_FRAMES, _FEWEST_TURNS = 6, 6
 Rows = Callable[[], Iterator[Row[list[float]]]]  # inertial ones, calibrated; begins again at every call
 
 
@@ -44,12 +45,15 @@ def judged_turns_of(
     return judged_turns(rig.cameras[camera], R_body_cam, tracks, rows, bias, f"cam{camera}")
 
 
-def contradicted_extrinsics(recording: Recording, seen: Sequence[tuple[ImageU8, ...]] = ()) -> tuple[str, ...]:
+def contradicted_extrinsics(
+    recording: Recording, seen: Sequence[tuple[ImageU8, ...]] = (), turns: Sequence[tuple[Array, Array]] = ()
+) -> tuple[str, ...]:
     """Return what contradicts the places of the cameras that a run read, and what to do then.
 
     Args:
         recording: is asked on disk, also where it is within others; its inertial data as they lie there.
         seen: images of some frames that the run took, which may be other ones than on disk, if there are any.
+        turns: rotations [3, 3] of the body by the gyroscope and by cam0; asked where there is nothing on disk.
     """
     inner, findings = recording, list[Finding]()
     try:
@@ -63,6 +67,8 @@ def contradicted_extrinsics(recording: Recording, seen: Sequence[tuple[ImageU8, 
             findings += judged_cameras(rig, [images[:used] for images in seen])
         if isinstance(inner, FileRecording) and inner.frame_count:
             findings += _on_disk(inner, not asks_seen)
+        elif len(turns) >= _FEWEST_TURNS:
+            findings += _turns_of_run(turns, recording.rig.T_body_cams[0][:3, :3])
     except DataError:
         return ()  # what cannot be read is said elsewhere
     return tuple(f"{finding.what}: {finding.next_step}" for finding in findings if finding.severity == "error")
@@ -79,6 +85,16 @@ def misplaced_depth(recording: Recording) -> str:
     except DataError:
         return ""  # what cannot be read is said elsewhere
     return "" if place is None else f"{misplaced_words(place)}: {MEND}"
+
+
+def _turns_of_run(turns: Sequence[tuple[Array, Array]], R_body_cam: Array) -> list[Finding]:
+    by_gyro, by_cam = (np.array(R) for R in zip(*turns, strict=True))
+
+    def differ(R: Array) -> float:
+        return float(np.median(angles_of(by_gyro.swapaxes(1, 2) @ (R @ by_cam @ R.T)) / angles_of(by_gyro)))
+
+    inverse = R_body_cam.T @ R_body_cam.T  # from axes of the body as given to those by the inverse
+    return turn_findings(TurnFit(differ(np.eye(3)), len(turns)), differ(inverse))
 
 
 def _on_disk(recording: FileRecording, asks_places: bool) -> list[Finding]:

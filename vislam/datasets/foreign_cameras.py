@@ -174,13 +174,9 @@ def _vins(data: Keys, path: Path) -> list[CameraCalibration]:
     offset_s = None if td is None else float(td)
     found = []
     if "model_type" in data:
-        R, t = (data.get(f"extrinsic{name}") for name in ("Rotation", "Translation"))
         T = pose_in(data, "body_T_cam0", path)
-        if R is not None and t is not None:
-            T = transform(
-                np.reshape(numbers_in(data, "extrinsicRotation", path, 9), (3, 3)),
-                np.array(numbers_in(data, "extrinsicTranslation", path, 3)),
-            )
+        if "extrinsicRotation" in data and "extrinsicTranslation" in data:  # one alone is refused
+            T = _of_two(data, "extrinsicRotation", "extrinsicTranslation", path)
         found.append(CameraCalibration(_vins_lens(data, path), T, time_offset_s=offset_s))
     else:
         for k in range(2):
@@ -228,17 +224,15 @@ def _orb_slam(data: Keys, path: Path) -> list[CameraCalibration]:
     T_c1_c2 = pose_in(data, "Stereo.T_c1_c2", path)
     T_c1_c2 = pose_in(data, "Tlr", path) if T_c1_c2 is None else T_c1_c2
     found = [CameraCalibration(_orb_lens(data, first, path), T_body_cam)]
-    if data.get("Stereo.b") is not None or (data.get("Camera.bf") is not None and "Camera2.fx" not in data):
-        b_m = data.get("Stereo.b")
-        b_m = float(data["Camera.bf"]) / found[0].camera.fx if b_m is None else float(b_m)
-        if "DepthMapFactor" not in data and "RGBD.DepthMapFactor" not in data:  # else it is a made-up one, of depth
-            T = transform(np.eye(3), np.array([b_m, 0.0, 0.0]))
-            found.append(
-                CameraCalibration(found[0].camera, None if T_body_cam is None else T_body_cam @ T, T_before_cam=T)
-            )
-    elif "Camera2.fx" in data:
+    b_m = data.get("Stereo.b", data.get("Camera.bf"))
+    is_depth = "DepthMapFactor" in data or "RGBD.DepthMapFactor" in data  # whose baseline is made up
+    if "Camera2.fx" in data and data.get("Camera.type") != "Rectified":
         T = None if T_body_cam is None or T_c1_c2 is None else T_body_cam @ T_c1_c2
         found.append(CameraCalibration(_orb_lens(data, "Camera2", path), T, T_before_cam=T_c1_c2))
+    elif b_m is not None and not is_depth:
+        b_m = float(b_m) if "Stereo.b" in data else float(b_m) / found[0].camera.fx
+        T = transform(np.eye(3), np.array([b_m, 0.0, 0.0]))
+        found.append(CameraCalibration(found[0].camera, None if T_body_cam is None else T_body_cam @ T, T_before_cam=T))
     _refuse_weighty(data, path, "IMU.T_b_c1 and Stereo.T_c1_c2")
     return found
 
@@ -294,7 +288,8 @@ def _basalt(data: Keys, path: Path) -> list[CameraCalibration]:
 def _okvis(data: Keys, path: Path) -> list[CameraCalibration]:
     found = []
     delays = (dict(data.get("camera_parameters") or {}).get("image_delay"), data.get("imageDelay"))
-    offset_s = next((-float(delay) for delay in delays if delay is not None), None)  # OKVIS subtracts it from stamps
+    offset_s = next((-float(delay) for delay in delays if delay is not None), None)
+    # okvis_ros/src/Subscriber.cpp: t -= imageDelay; OKVIS 2: correct stamp = stamp - image_delay
     for entry in data["cameras"][:2]:
         keys = Keys(entry)
         width, height = numbers_in(keys, "image_dimension", path, 2)
@@ -337,21 +332,18 @@ def _opencv_pair(data: Keys, path: Path) -> list[CameraCalibration]:
     size = [named[key] for key in ("imagewidth", "imageheight") if key in named]
     beside = path.with_name(f"extrinsics{path.suffix}")
     place = data if data.get("R") is not None else load_keys(beside)  # its program writes two files
-    t = np.array(numbers_in(place, "T", path, 3))
-    if len(size) < 2 or np.linalg.norm(t) > _MOST_BASELINE_M:
-        lacks = (
-            f"T of {np.linalg.norm(t):.3g} m is no pair's: write metres" if len(size) == 2 else "it has no image size"
-        )
-        raise DataError(
-            f"{path}: a pair of OpenCV; {lacks}" + ("" if len(size) == 2 else ": add image_width, image_height")
-        )
+    t = numbers_in(place, "T", path, 3)
+    if len(size) < 2:
+        raise DataError(f"{path}: a pair of OpenCV; it has no image size: add image_width, image_height")
+    if np.linalg.norm(t) > _MOST_BASELINE_M:
+        raise DataError(f"{path}: a pair of OpenCV; T of {np.linalg.norm(t):.3g} m is no pair's: write metres")
     cameras = []
     for k in "12":
         K, d = (next((named[of + k] for of in names if of + k in named), names[0].upper() + k) for names in _PAIR)
         cameras.append(ros_camera(
             (int(data[size[0]]), int(data[size[1]])), np.reshape(numbers_in(data, K, path, 9), (3, 3)), _RATIONAL,
             numbers_in(data, d, path), str(path)))  # fmt: skip
-    T = invert(transform(np.reshape(numbers_in(place, "R", path, 9), (3, 3)), t))
+    T = invert(_of_two(place, "R", "T", path))
     data.name_unused(path, "R and T in metres", (*_OPENCV_SILENT, "R1", "R2", "P1", "P2", "Q", "E", "F"))
     return [CameraCalibration(cameras[0]), CameraCalibration(cameras[1], T_before_cam=T)]
 
@@ -361,12 +353,20 @@ _PROGRAMS: tuple[tuple[str, Callable[[Keys], bool], Callable[[Keys, Path], list[
     ("VINS", lambda data: "model_type" in data or "cam0_calib" in data, _vins),
     ("ORB-SLAM", lambda data: "Camera.fx" in data or "Camera1.fx" in data, _orb_slam),
     ("OKVIS", lambda data: "T_SC" in _first_of(data), _okvis),
-    ("maplab", lambda data: "T_B_C" in _first_of(data), _maplab),
+    ("maplab", lambda data: "camera" in _first_of(data), _maplab),
     ("OpenCV", lambda data: any({f"{name}1", f"{name}2"} <= {str(key).lower().replace("_", "") for key in data}
                                 for name in _PAIR[0] + _PAIR[1][:1]) and "fl_x" not in data, _opencv_pair),
     ("ROS or OpenCV", lambda data: any(
         _OPENCV.get(str(key).lower().replace("_", "")) == "camera_matrix" for key in data), _ros_or_opencv),
 )  # fmt: skip
+
+
+def _of_two(data: Mapping[str, Any], turn: str, place: str, path: Path) -> Array:
+    """Return the pose [4, 4] of a rotation and a translation; raises DataError unless it is rigid."""
+    R, t = np.reshape(numbers_in(data, turn, path, 9), (3, 3)), numbers_in(data, place, path, 3)
+    T = pose_in({turn: np.column_stack((R, t)).tolist()}, turn, path)
+    assert T is not None
+    return T
 
 
 def _first_of(data: Keys) -> Mapping[str, Any]:

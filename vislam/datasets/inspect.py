@@ -144,9 +144,8 @@ class _Inspector:
     def _add_problem(self, kind: str, count: int, frames: FrameTable | None) -> None:
         total = len(frames.t_ns) if frames is not None else 0
         minor = kind == "frame without depth" and count < 0.2 * total
-        self._add(
-            "ok" if minor else "warning", f"{kind}: {count}", self._found.root.name, "skipped or bridged in a run"
-        )
+        severity: Severity = "ok" if minor else "warning"
+        self._add(severity, f"{kind}: {count}", self._found.root.name, "skipped or bridged in a run")
 
     def _check_stream(self, name: str, t_ns: Stamps) -> None:
         """Summarise a stream and judge how even it is."""
@@ -234,7 +233,8 @@ class _Inspector:
 
     def _check_imu(self) -> ImuFacts | None:
         if not self._found.has_imu:
-            self._add("ok", "no IMU: vision alone gives the motion", str(self._found.root))
+            if self._found.cameras:
+                self._add("ok", "no IMU: vision alone gives the motion", str(self._found.root))
             return None
         if self._found.imu_file is not None:
             self._size_bytes += self._found.imu_file.stat().st_size
@@ -335,7 +335,7 @@ class _Inspector:
 
     def _check_truth(self, frames: FrameTable | None) -> None:
         if self._found.truth is None:
-            self._add("ok", "no truth: it can be run but not scored", str(self._found.root))
+            self._add("ok", "no truth: a run is not scored", str(self._found.root))
             return
         try:
             truth = self._found.truth(self._problems)

@@ -141,6 +141,12 @@ def read_names(
     return read_rows(path, parse, problems, separator, needs_line_end=False)
 
 
+def film_stamps(film: Path) -> Path:
+    """Return the file of the stamps of a film's frames, also as OpenCamera Sensors names it; `ride.csv` if none is."""
+    named = [film.with_name(film.stem + end) for end in (".csv", "_timestamps.csv", "_imu_timestamps.csv")]
+    return next((file for file in named if file.is_file()), named[0])
+
+
 def read_frame_stamps(
     path: Path, problems: Problems, parse_stamp: Callable[[str], int] = parse_ns
 ) -> Iterator[Row[str]]:

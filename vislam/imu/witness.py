@@ -26,6 +26,7 @@ _LONGEST_NS = 2 * _BASE_NS  # between two frames; more is a stretch without sigh
 _USUAL_OF, _FEWEST = 41, 11  # comparisons that say what is usual, and how many there have to be
 _UNUSUAL = 10.0  # times the usual difference: vision errs by a few times of it where it blurs
 _TURN_RAD, _TURN_SHARE = np.deg2rad(0.5), 0.1  # that blurred images may be off by, and as much of the turn itself
+_LARGE_RAD = np.deg2rad(3.0)  # of a turn that shows how the camera stands on the body
 _MISTAKEN = 2.0  # times that without metres: a turn looks much like a motion to the side
 _FORCE_M_S2, _FORCE_SHARE = 1.0, 0.1  # the same of gravity: a place is off by a centimetre then
 # without metres, mean acceleration over half a second is not seen: as much may be, and as many times the usual
@@ -78,12 +79,14 @@ class MotionWitness:
         until_ns: samples after this time are no information; None: all are believed.
         since_ns: when the newest contradiction began; 0: there was none.
         doubted_ns: when samples last contradicted what was seen; 0: never.
+        turns: the last large ones of the body, [3, 3] by gyroscope and by vision.
     """
 
     def __init__(self) -> None:
         """Believe, before the first frame."""
         self.until_ns: int | None = None
         self.since_ns = self.doubted_ns = 0
+        self.turns = deque[tuple[Array, Array]](maxlen=_USUAL_OF)
         self._calm_ns = 0, 0  # the newest frame at which nothing had begun, and the one before it
         self._frames: list[_Seen] = []
         self._turns_rad, self._forces_m_s2 = deque[float](maxlen=_USUAL_OF), deque[float](maxlen=_USUAL_OF)
@@ -139,7 +142,11 @@ class MotionWitness:
         if middle < 0:
             return
         self._frames, middle, first = self._frames[max(first, 0) :], middle - max(first, 0), min(first, 0)
-        off_rad, turn_rad = _turns(self._frames[middle:])
+        R_gyro, R_seen = _turns(self._frames[middle:])
+        off_rad, *turns = (float(np.linalg.norm(so3_log(R))) for R in (R_gyro.T @ R_seen, R_gyro, R_seen))
+        turn_rad = max(turns)
+        if turns[0] > _LARGE_RAD:
+            self.turns.append((R_gyro, R_seen))
         may_rad = _TURN_RAD if is_metric else _MISTAKEN * _TURN_RAD
         off, is_calm = self._off(off_rad, self._turns_rad, may_rad + _TURN_SHARE * turn_rad)
         tells = turn_rad > 2.0 * _TURN_RAD
@@ -208,14 +215,12 @@ def _before(frames: Sequence[_Seen], k: int) -> int:
     return next((i for i in range(k - 1, -1, -1) if frames[k].t_ns - frames[i].t_ns >= _BASE_NS), -1)
 
 
-def _turns(frames: Sequence[_Seen]) -> tuple[float, float]:
-    """Return by what the turns over some frames differ, and the larger of the two, in rad."""
+def _turns(frames: Sequence[_Seen]) -> tuple[Array, Array]:
+    """Return the turns [3, 3] over some frames by gyroscope and by vision."""
     R_gyro = np.eye(3)
     for frame in frames[1:]:
         R_gyro = R_gyro @ frame.R_gyro
-    R_seen = np.ascontiguousarray(frames[0].T_vo_body[:3, :3].T @ frames[-1].T_vo_body[:3, :3])
-    off, *turns = (float(np.linalg.norm(so3_log(np.ascontiguousarray(R)))) for R in (R_gyro.T @ R_seen, R_gyro, R_seen))
-    return off, max(turns)
+    return R_gyro, np.ascontiguousarray(frames[0].T_vo_body[:3, :3].T @ frames[-1].T_vo_body[:3, :3])
 
 
 def _mean_gravity(frames: Sequence[_Seen]) -> Array:

@@ -145,6 +145,8 @@ def read_rows(path: Path, columns: tuple[str, ...]) -> list[tuple[int, dict[str,
             return rows
     except (csv.Error, UnicodeDecodeError) as error:
         raise DataError(f"{path} is not a CSV file: {error}") from error
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 def _number(text: str) -> float:

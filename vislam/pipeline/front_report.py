@@ -66,6 +66,7 @@ class FrontReport:
     is_confirmed: bool = True  # the start, by what came after it
     lost_reason: str = ""  # why vision lost most of the frames that it lost
     events: tuple[StreamEvent, ...] = ()  # what happened in the streams of camera and IMU
+    turns: tuple[tuple[Array, Array], ...] = ()  # the last large ones [3, 3] of the body, by gyroscope and by vision
 
     @property
     def alignment(self) -> Alignment:
@@ -217,7 +218,7 @@ def report_of(front: Front) -> FrontReport:
     )  # fmt: skip
     if imu is None:
         return report
-    report = replace(report, coupling=imu.filtering.coupling, condition=imu.condition.condition())
+    report = replace(report, coupling=imu.filtering.coupling, condition=imu.condition.condition(), turns=imu.turns)
     floor = imu.buffer.noise_floor
     if begun.phase is Phase.VISION_ALONE or floor is None:
         return report

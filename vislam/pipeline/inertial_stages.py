@@ -67,6 +67,11 @@ class Inertial:
         floor = self.buffer.noise_floor
         return AS_MODELLED if floor is None else floor.now.scale
 
+    @property
+    def turns(self) -> tuple[tuple[Array, Array], ...]:
+        """The last large turns [3, 3] of the body, by gyroscope and by vision."""
+        return tuple(self._witness.turns)
+
     def since(self, last_t_ns: int | None, t_ns: int, clock: CameraClock) -> Since:
         """Return what is known of the motion since the last frame, None: there was none, with `clock` the camera's."""
         span = None if last_t_ns is None else self.buffer.unbroken(last_t_ns, t_ns)

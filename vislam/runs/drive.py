@@ -231,7 +231,7 @@ class Run:
             self.joined_t_ns = packet.keyframe.t_ns
 
     def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
-        mapper = None if is_brief else self._mapper
+        mapper, self.witness.is_hurried = None if is_brief else self._mapper, is_brief
         finish = self.slam.finish()
         for step in finish.steps:
             self._take(step)
@@ -324,7 +324,7 @@ class Run:
         if back is not None:
             counters |= back.counters
         gathered = self._evidence(front, final)
-        evidence, verdict = judged(gathered, self.config.verdict, self.recording, self.witness.seen)
+        evidence, verdict = judged(gathered, self.config.verdict, self.recording, self.witness.seen, front.turns)
         self.warnings += front.noise_warnings
         found = self._found_in_map()
         by_truth, not_compared = accuracy(self.log, final, truth, front.alignment, self._input.problems)

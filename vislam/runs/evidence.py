@@ -313,17 +313,22 @@ def _apart(log: RunLog, final: Trajectory, states: dict[int, NavState]) -> Apart
 
 
 def judged(
-    evidence: Evidence, config: VerdictConfig, recording: Recording, seen: Sequence[tuple[ImageU8, ...]] | None
+    evidence: Evidence,
+    config: VerdictConfig,
+    recording: Recording,
+    seen: Sequence[tuple[ImageU8, ...]] | None,
+    turns: Sequence[tuple[Array, Array]] = (),
 ) -> tuple[Evidence, Verdict]:
     """Return evidence and verdict; of a run that is not trusted with what contradicts its extrinsics.
 
     They are the usual cause of a run that fails from its first frame on. Depth of another lens is smooth and agrees
-    with itself, so it is asked of every run. `seen` is as for `contradicted_extrinsics`; with None nothing is asked.
+    with itself, so it is asked of every run. `seen` and `turns` are as for `contradicted_extrinsics`; with None nothing
+    is asked.
     """
     if seen is not None and recording.rig.has_depth:
         evidence = replace(evidence, misplaced_depth=misplaced_depth(recording))
     verdict = judge(evidence, config)
     if verdict.state is not Trust.TRUSTED and seen is not None:
-        evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen) + evidence.causes)
+        evidence = replace(evidence, causes=contradicted_extrinsics(recording, seen, turns) + evidence.causes)
         verdict = judge(evidence, config)
     return evidence, verdict

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vislam.config import Config, MachineConfig, dump, from_data, recorded
 from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import csv_text, write_json, write_text
+from vislam.core.files import csv_text, refuse_links_out, write_json, write_text
 from vislam.core.log import FILE_NAME, is_written_to
 from vislam.core.memory import FrameEntry, SlamMemory
 from vislam.core.messages import (
@@ -79,6 +79,7 @@ def prepare(out: Path, overwrite: bool, base: MapChoice | None = None) -> None:
             raise UsageError(f"--out {out} exists and is not a run; choose a new folder")
         if not (overwrite or is_empty):
             raise UsageError(f"--out {out} already holds a run; add --overwrite or choose a new folder")
+        refuse_links_out(out)
         if is_written_to(out):
             raise UsageError(f"another vislam is at work in --out {out}; wait for its end or choose a new folder")
         with storage(out):
@@ -179,9 +180,10 @@ def read_metrics(run: Path) -> dict[str, Any]:
         return {}
     try:
         metrics = read_json(path)
-        if not (isinstance(metrics, dict) and all(isinstance(metrics.get(k, {}), dict) for k in ("accuracy", "batch"))):
+        sections = [metrics.get(name, {}) for name in ("accuracy", "batch", "sensors")]  # each by names
+        if not all(isinstance(s, dict) and all(isinstance(entry, dict) for entry in s.values()) for s in sections):
             raise ValueError("it holds something else than metrics")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, AttributeError) as error:
         raise DataError(f"{path} cannot be used: {error}; remove it, or run the recording again") from error
     return metrics
 

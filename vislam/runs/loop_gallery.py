@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.files import replacing
 from vislam.core.messages import Array, ImageU8, LoopDecision
 from vislam.loop import LoopRow
 from vislam.pipeline.steps import KeyframeStep
@@ -53,7 +54,7 @@ class LoopGallery:
 
     def _keep(self, keyframe_id: int, image: ImageU8) -> None:
         scale = _WIDTH_PX / image.shape[1]
-        small = cv2.resize(image, (_WIDTH_PX, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(image, (_WIDTH_PX, max(round(image.shape[0] * scale), 1)), interpolation=cv2.INTER_AREA)
         jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])[1]
         self._thumbnails[keyframe_id] = (jpeg, scale)
         self._bytes += jpeg.nbytes
@@ -80,7 +81,8 @@ class LoopGallery:
             picture = self._draw(row, matches[k].astype(np.float64))
             with storage(path):
                 path.parent.mkdir(exist_ok=True)
-                path.write_bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+                with replacing(path) as file:
+                    file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
             written.append((row, path))
         return written
 

@@ -113,7 +113,7 @@ def sensors_entry(
 
 def with_own_of_graph(sensors: dict[str, dict[str, Any]], graph: FinalGraph | None) -> dict[str, dict[str, Any]]:
     """Return entries of sensors with their own variables as a graph has them now."""
-    found = {name: graph.own(name) for name, entry in sensors.items() if graph is not None and entry["variables"]}
+    found = {name: graph.own(name) for name, entry in sensors.items() if graph is not None and entry.get("variables")}
     return {
         name: entry if (own := found.get(name)) is None else entry | {
             "graph": {"values": own[0].tolist(), "sigmas": own[1].tolist()}

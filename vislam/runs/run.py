@@ -7,6 +7,7 @@ from typing import Any
 
 from vislam.config import Config, load
 from vislam.core.errors import VislamError
+from vislam.core.files import refuse_links_out
 from vislam.core.log import log_to
 from vislam.core.progress import Progress, silent
 from vislam.core.recording import MaskedRecording, Masker, Recording
@@ -87,6 +88,7 @@ def written_up(out: Path, command: Sequence[str], is_hurried: Callable[[], bool]
     """
     from vislam.runs import report  # what draws is loaded by the first use, when the run has given its memory back
 
+    refuse_links_out(out)
     with log_to(out, command):
         try:
             yield

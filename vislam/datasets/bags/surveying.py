@@ -187,16 +187,14 @@ def _noise(path: Path, imu: Entry, found: _Found) -> ImuNoise | None:
 
 
 def _topics(listing: Listing, roles: dict[str, str]) -> tuple[TopicSummary, ...]:
+    unused = {one.topic.name: f"not used; poses, for truth={one.topic.name}" for one in listing.of_type(*POSES)}
     return tuple(
         TopicSummary(
-            name,
-            entry.topic.schema or entry.topic.type,
-            entry.count,
-            entry.rate_hz,
-            roles.get(name, why_unreadable(entry.topic) or "not used"),
+            name, entry.topic.schema or entry.topic.type, entry.count, entry.rate_hz,
+            roles.get(name, why_unreadable(entry.topic) or unused.get(name, "not used")),
         )
         for name, entry in sorted(listing.entries.items())
-    )
+    )  # fmt: skip
 
 
 def _places(listing: Listing) -> dict[str, str]:

@@ -38,7 +38,7 @@ from vislam.datasets.imu_tables import (
 )
 from vislam.datasets.loaders import check_film
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import Row, header, parse_ns, parse_seconds, read_frame_stamps
+from vislam.datasets.tables import Row, film_stamps, header, parse_ns, parse_seconds, read_frame_stamps
 from vislam.trajectory.formats import is_number
 
 LOOKS_FOR = (
@@ -216,7 +216,7 @@ def _frames(path: Path, logger: Logger | None, problems: Problems) -> tuple[Imag
     video, stamps = path / "frames.mov", path / "frames.csv"
     if logger == "two tables":
         video, parse = _films(path)[0], parse_ns
-        stamps = video.with_suffix(".csv")
+        stamps = film_stamps(video)
         if len(_films(path)) > 1:
             raise DataError(f"{path} holds {len(_films(path))} films; keep one, or name one as video:FILE")
     if logger == "MARS logger":

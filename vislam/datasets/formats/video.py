@@ -28,9 +28,9 @@ from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_pairs import ImuRows
 from vislam.datasets.imu_tables import Pair, pair_in
-from vislam.datasets.loaders import check_film
+from vislam.datasets.loaders import check_film, open_video
 from vislam.datasets.stream import Survey, image_list
-from vislam.datasets.tables import Row, read_frame_stamps
+from vislam.datasets.tables import Row, film_stamps, read_frame_stamps
 from vislam.datasets.telemetry import (
     Film,
     JoinedTelemetry,
@@ -76,7 +76,7 @@ def _survey(path: Path, joined: bool) -> Survey:
     imu_file, imu_noise, T_body_imu = None, None, np.eye(4)
     cameras: tuple[ImageList, ...] = ()
     film: Film | None = None
-    joined = joined and not path.with_suffix(".csv").is_file() and not path.with_suffix(".imu.csv").is_file()
+    joined = joined and not film_stamps(path).is_file() and not path.with_suffix(".imu.csv").is_file()
     rig, telemetry = None, _telemetry(path, joined)
     findings = [] if telemetry is None else telemetry.findings()
     if (why := _why_unused(path)) and telemetry is not None and telemetry.has_imu:
@@ -127,11 +127,12 @@ def _imu(path: Path) -> tuple[ImuNoise, NDArray[np.float64]]:
 
 
 def _frames(path: Path, problems: Problems, own_clock: bool) -> ImageList:
-    stamps = path.with_suffix(".csv")
+    stamps = film_stamps(path)
     if stamps.is_file():
         return image_list("cam0", path.parent, read_frame_stamps(stamps, problems), problems)
     if is_mp4(path) and not own_clock:  # else the IMU would have another
         return image_list("cam0", path.parent, _own_times(path), problems)
+    open_video(path).release()  # a film that cannot be read is what is wrong first
     raise DataError(f"{stamps} is missing; write one row a frame into it: the time of its exposure in ns")
 
 
@@ -156,8 +157,8 @@ def _why_unused(path: Path) -> str:
     """Return why the IMU of a telemetry is left aside, empty where it is not."""
     if path.with_suffix(".imu.csv").is_file():
         return f"{path.with_suffix('.imu.csv').name} takes its place"
-    if path.with_suffix(".csv").is_file():
-        return f"its clock is the video's, and {path.with_suffix('.csv').name} stamps the frames by another"
+    if (stamps := film_stamps(path)).is_file():
+        return f"its clock is the video's, and {stamps.name} stamps the frames by another"
     if not path.with_suffix(".imu.yaml").is_file():
         return f"write its noise into {path.with_suffix('.imu.yaml').name}, see docs/formats.md"
     return ""

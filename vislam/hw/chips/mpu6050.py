@@ -28,6 +28,7 @@ IDS = {0x68: "MPU-6050", 0x70: "MPU-6500", 0x71: "MPU-9250", 0x73: "MPU-9255"}
 # MPU-6515, MPU-6880, ICM-20689 and what is sold as an MPU-6050 or MPU-9250 with their ids: like an MPU-6500 where known
 CLONE = "mpu6050-clone"  # its name on a command line
 CLONE_IDS = frozenset((0x72, 0x74, 0x78, 0x98))
+_DOUBT = "a clone, taken for an MPU-6500; its gyroscope's scale shows in `vislam calibrate imu`"
 SAMPLE_BYTES = 12
 
 _SMPLRT_DIV, _FIFO_EN, _INT_PIN_CFG, _INT_ENABLE, _INT_STATUS, _TEMPERATURE = 0x19, 0x23, 0x37, 0x38, 0x3A, 0x41
@@ -70,7 +71,7 @@ class Mpu6050:
 
     def _take_id(self, found: int) -> None:
         if found in CLONE_IDS and self._is_clone_taken:
-            self.name, self.doubt = f"MPU-6050 clone 0x{found:02x}", "a clone, taken for an MPU-6500"
+            self.name, self.doubt = f"MPU-6050 clone 0x{found:02x}", _DOUBT
         else:
             self.name = refuse_other(self._bus, self.address, found, IDS)
         self._is_first = found == 0x68

@@ -142,7 +142,6 @@ class _LiveRun(Run):
 
     def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:
         """Write all files; without map and pictures where the run has to end soon."""
-        self.witness.is_hurried = self._followed.life.is_brief
         return super()._finish(start, is_brief or self._followed.life.is_brief)
 
     def _settle(self, update: GraphUpdate, record: GraphRecord) -> None:

@@ -71,8 +71,8 @@ class SlotWriter:
 
     def close(self) -> None:
         """Remove the memory, unless another writer has taken its name; may be called twice."""
-        with suppress(FileNotFoundError):
-            if self._path.stat().st_ino == self._inode:
+        with suppress(OSError):  # it was removed, or is another user's
+            if self._path.lstat().st_ino == self._inode:
                 self._path.unlink()
         self._memory.close()
 
@@ -87,15 +87,19 @@ class SlotReader:
         """
         path, trusted = _FOLDER / name, {os.geteuid(), 0} | ({user_of(owner)} if owner else set())
         try:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
             try:
                 found = os.fstat(descriptor)
-                if found.st_uid not in trusted or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-                    who = f"that of user {found.st_uid}, who" if found.st_uid not in trusted else "open to others, who"
-                    raise DataError(f"shared memory {path} is {who} may write anything into it")
+                if found.st_uid not in trusted:
+                    who = f"that of user {found.st_uid}; if that is who runs `vislam live`, name this owner"
+                    raise DataError(f"shared memory {path} is {who}")
+                if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                    raise DataError(f"shared memory {path} is open to others, who may write anything into it")
                 self._memory = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
             finally:
                 os.close(descriptor)
+        except PermissionError as error:
+            raise DataError(f"shared memory {path} is another user's, who may let groups read: --live.group") from error
         except (OSError, ValueError) as error:
             raise DataError(f"there is no shared memory {path}: {error}; is `vislam live` running?") from error
         self._tail = len(self._memory) - _TAIL.size

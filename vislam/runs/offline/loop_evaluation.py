@@ -112,25 +112,6 @@ def judge_loops(run: Path, rule: LoopTruthConfig, reference: Path | None = None)
     return JudgedLoops(places.revisits, stages, _judged_edges(rows, places), _proposals(tried, places), found)
 
 
-def pooled(runs: Sequence[JudgedLoops]) -> JudgedLoops:
-    """Return several runs as one: their keyframes after each other."""
-    stages = {
-        name: Detections(
-            np.concatenate([run.stages[name].score for run in runs]),
-            np.concatenate([run.stages[name].verdict for run in runs]),
-        )
-        for name in runs[0].stages
-    }
-    sources = sorted({source for run in runs for source in run.proposals})
-    proposals = {}
-    for source in sources:
-        each = [run.proposals.get(source, (0, 0)) for run in runs]
-        proposals[source] = (sum(count for count, _ in each), sum(near for _, near in each))
-    found = {step: sum(run.found[step] for run in runs) for step in runs[0].found}
-    edges = [edge for run in runs for edge in run.edges]
-    return JudgedLoops(np.concatenate([run.revisits for run in runs]), stages, edges, proposals, found)
-
-
 def summarise(judged: JudgedLoops, rule: LoopTruthConfig) -> dict[str, Any]:
     """Return the rule, the figures and curves of every stage, and the errors of the edges, as plain data."""
     return {

@@ -153,7 +153,8 @@ def picture(path: Path, caption: str, kind: str = "") -> str:
     # written again: no byte of the file itself leaves, which may be a link to anything
     keeps = len(data) <= _KEEP_BYTES and path.suffix == ".png"
     scale = 1.0 if keeps else min(1.0, _MAX_PICTURE_PX / max(image.shape[:2]))
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
+    size = (max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
     suffix, options = (".png", []) if keeps else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 90])
     data, mime = cv2.imencode(suffix, small, options)[1].tobytes(), "image/png" if keeps else "image/jpeg"
     encoded = base64.b64encode(data).decode("ascii")

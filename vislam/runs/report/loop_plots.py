@@ -8,6 +8,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from vislam.core.files import replacing
 from vislam.runs.report.style import CODE, RC, light, svg
 
 STAGES = {
@@ -39,8 +40,10 @@ def loop_quality(answer: dict[str, Any]) -> str:
 def write_loop_plot(path: Path, answers: Mapping[str, dict[str, Any]]) -> None:
     """Write the pictures of evaluations as one PNG, a row per evaluation; the same ones give the same bytes."""
     colors, rc = light()
-    with mpl.rc_context(rc):
-        _figure(answers, colors).savefig(path, dpi=110, facecolor=colors["paper"], metadata={"Software": None})
+    with mpl.rc_context(rc), replacing(path) as file:
+        _figure(answers, colors).savefig(
+            file, format="png", dpi=110, facecolor=colors["paper"], metadata={"Software": None}
+        )
 
 
 def _figure(answers: Mapping[str, dict[str, Any]], colors: Mapping[str, str]) -> Figure:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
+from vislam.core.files import leads_out
 from vislam.core.messages import Array, NavState, Tracking
 from vislam.core.reading import read_json
 from vislam.loop import LoopRow, read_loops, read_rows
@@ -108,10 +109,9 @@ def _belongs(path: Path, folder: Path, unread: dict[str, str]) -> bool:
     """Return whether a file is there and lies in the folder: a report is passed on with what it was made of."""
     if not path.is_file():
         return False
-    inside = path.resolve().is_relative_to(folder.resolve())
-    if not inside:
+    if is_out := leads_out(path, folder):
         unread[str(path.relative_to(folder))] = f"{path} is a link that leads out of the run folder"
-    return inside
+    return not is_out
 
 
 def _read_json(path: Path) -> dict[str, Any]:

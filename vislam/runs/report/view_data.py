@@ -100,7 +100,7 @@ def _small(data: bytes) -> bytes | None:
     if image is None:
         return None
     scale = _WIDTH_PX / image.shape[1]
-    size = (_WIDTH_PX, max(round(image.shape[0] * scale), 1))
+    size = (_WIDTH_PX, min(max(round(image.shape[0] * scale), 1), 4 * _WIDTH_PX))  # no camera's is so high
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR)
     return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
 

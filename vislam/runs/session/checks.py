@@ -46,6 +46,7 @@ _COVERED_LATER: dict[int, dict[str, tuple[tuple[int, ...], ...]]] = {  # by the 
     FIRST_WITH_FURTHER: {"further": (tuple(range(4)),)},
 }
 _COVERED_ALL = _COVERED | {table: columns for tables in _COVERED_LATER.values() for table, columns in tables.items()}
+_KINDS: dict[str, tuple[type, ...]] = {"INTEGER": (int,), "REAL": (float,), "TEXT": (str,), "BLOB": (bytes,)}
 _EXACT = 2**53  # whole numbers below are the same to SQLite, whether they were given as int or as float
 
 
@@ -80,7 +81,13 @@ def check_records(db: sqlite3.Connection, path: Path) -> None:
     with readable(path):
         later = [tables for first, tables in _COVERED_LATER.items() if is_since(db, first)]
         for table, covered in [pair for tables in (_COVERED, *later) for pair in tables.items()]:
+            stated = [_KINDS[kind] for _, _, kind, *_ in db.execute(f"PRAGMA table_info({table})")]
             for number, row in enumerate(db.execute(f"SELECT * FROM {table}")):
+                if not all(value is None or isinstance(value, kinds) for value, kinds in zip(row, stated, strict=True)):
+                    raise DataError(
+                        f"session {path} is damaged: record {number} of {table} has values of other types; run the "
+                        "recording again"
+                    )
                 count = len(row) - len(covered)
                 if checksums(table, row[:count]) != row[count:]:
                     raise DataError(

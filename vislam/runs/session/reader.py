@@ -206,8 +206,10 @@ class Session:
 
     def retrieved(self) -> list[RetrievedKeyframe]:
         """Return what the index found, in order."""
-        rows = self.rows("SELECT from_id, to_id, score, island_score, consistency FROM retrieved ORDER BY number")
-        return [RetrievedKeyframe(*row) for row in rows]
+        rows, nan = self.rows("SELECT * FROM retrieved ORDER BY number"), float("nan")
+        return [
+            RetrievedKeyframe(a, b, nan if s is None else s, nan if i is None else i, n) for _, a, b, s, i, n, _ in rows
+        ]
 
     def words(self) -> WordsMemory | None:
         """Return the words that the run trained last; None: it trained none."""
@@ -225,7 +227,9 @@ class Session:
 
     def shifts(self) -> dict[int, tuple[float, float]]:
         """Return the rms and largest shift in metres of the update that took in each loop edge."""
-        rows = self.rows("SELECT id, moved_rms_m, moved_max_m FROM edges WHERE moved_rms_m IS NOT NULL ORDER BY id")
+        rows = self.rows(
+            "SELECT id, moved_rms_m, moved_max_m FROM edges WHERE moved_rms_m + moved_max_m IS NOT NULL ORDER BY id"
+        )
         return {i: (rms_m, max_m) for i, rms_m, max_m in rows}
 
     def frames(self) -> list[FrameEntry]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from vislam.config import VerdictConfig
 from vislam.core.chi_square import chi_square_limit
+from vislam.core.streams import Happening
 from vislam.runs.verdict.evidence import Evidence, Moved
 
 # of the camera's clock as given: drivers that stamp on arrival are off by up to 30 ms
@@ -128,7 +129,9 @@ def _lost(e: Evidence, _: VerdictConfig) -> Iterator[str]:
 
 def _streams(e: Evidence, _: VerdictConfig) -> Iterator[str]:
     """Name what happened to sensors: much of what else is wrong comes of that."""
-    yield from (f"{event}: look at the sensor's cable, driver and clock, and the machine's load" for event in e.events)
+    for event in e.events:
+        first = "axes (T_BS, or its inverse), " if Happening.CONTRADICTING.words in event else ""
+        yield f"{event}: look at the sensor's {first}cable, driver and clock, and the machine's load"
     if e.dark_s > LOST_S:
         yield f"images were dark for {e.dark_s:.1f} s: look at the lens, the light and the exposure"
 

@@ -283,7 +283,7 @@ class RunViewer:
 
     def _jpeg(self, image: ImageU8) -> tuple[Any, float]:
         scale = self._config.image_width_px / image.shape[1]
-        size = (self._config.image_width_px, round(image.shape[0] * scale))
+        size = (self._config.image_width_px, max(round(image.shape[0] * scale), 1))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         _, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         return rr.EncodedImage(contents=encoded.tobytes(), media_type="image/jpeg"), scale

@@ -119,7 +119,7 @@ static inline int vislam_pose_is_sound(const vislam_pose *pose) {
 static inline const vislam_pose_slot *vislam_pose_open_of(const char *path, uid_t owner) {
     struct stat found;
     void *memory = MAP_FAILED;
-    int file = open(path, O_RDONLY);
+    int file = open(path, O_RDONLY | O_NOFOLLOW);
     if (file < 0) return NULL;
     if (fstat(file, &found) == 0 && S_ISREG(found.st_mode) && (found.st_mode & (S_IWGRP | S_IWOTH)) == 0 &&
         (found.st_uid == geteuid() || found.st_uid == owner || found.st_uid == 0) &&
