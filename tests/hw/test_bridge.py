@@ -224,7 +224,7 @@ def test_a_restarted_board_gets_a_new_clock_at_once(config: SerialConfig, board:
 
 
 def frame(sequence: int, t_us: int) -> protocol.RawSample:
-    return protocol.RawSample(sequence, t_us, protocol.Status(0), (0, 0, 0), (0, 0, 0), (0, 0, 0), 0)
+    return protocol.RawSample(sequence, t_us, protocol.Status(0), (0, 0, 0), (sequence % 2, 0, 0), (0, 0, 0), 0)
 
 
 @pytest.mark.parametrize("up_us", [20_000_000, 3_000_000_000])

@@ -312,8 +312,7 @@ def test_a_ride_through_the_serial_bridge_and_its_unplugged_port(tmp_path: Path)
         path, driven_m = source.true_path(), [pose.T_odom_base[0, 3] for pose in poses if is_valid(pose)]
         if path and path[-1].t_s > 7.0:
             since.append(len(poses))
-            later = poses[since[0] :]
-            if len(later) > 200 and all(map(is_valid, later[-200:])) and np.ptp(driven_m) > 0.6:
+            if sum(map(is_valid, poses[since[0] :])) > 200 and np.ptp(driven_m) > 0.6:
                 run.stop()
 
     ear = threading.Thread(target=hear)
@@ -349,7 +348,7 @@ def test_a_chip_behind_its_bridge_may_freeze(tmp_path: Path) -> None:
             return True
 
     drive = Drive(name, 0.0, 0.0, 0.0)
-    told = (Running(), port, name, epoch, 9.81, 0, ((0.0, 600.0),), "frozen")
+    told = (Running(), port, name, epoch, 9.81, 0, ((0.0, 600.0),), ("frozen",))
     board = threading.Thread(target=run_board, args=told)
     board.start()
     try:

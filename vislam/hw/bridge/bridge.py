@@ -120,10 +120,10 @@ class SerialBridge:
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the first sample, `timeout_s` at most."""
-        if self._first:
-            first, self._first = self._first, []
-            return first
+        first, self._first = self._first, []
         now = time.monotonic_ns()
+        if first and now - self._newest_ns < 2 * _NS:  # else the others took long to start
+            return first
         deadline = now + round(timeout_s * _NS)
         while True:
             if self._port is None and now >= self._retry_ns:

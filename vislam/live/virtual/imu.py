@@ -101,11 +101,11 @@ class VirtualGy85:
 
 def run_board(
     life: Life, port: Path, cart: str, epoch: Epoch, gravity_m_s2: float, seed: int,
-    outages: tuple[tuple[float, float], ...], fault: str,
+    outages: tuple[tuple[float, float], ...], faults: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Be the serial bridge's board on the cart until the run ends; `port` is a link to its pseudo-terminal.
 
-    In each of `outages` it is `unplugged`, or has the fault of that name in `LineFaults`.
+    In each of `outages` it is `unplugged`, or has the fault of that name in `LineFaults`: one of `faults` in turn.
     """
     truth = _truth(Follower.waiting(cart), epoch.peek_ns, gravity_m_s2)
     with BridgeEmulator(port, truth, seed, _DRIFT, gy85_errors(seed)) as board:
@@ -114,12 +114,9 @@ def run_board(
         begin_ns, spans = epoch.begin_ns(), _Outages(outages)
         while not life.stopped:
             is_out = spans.is_out(time.monotonic_ns() - begin_ns)
-            if fault != "unplugged":
-                board.faults = replace(LineFaults(), **{fault: is_out})
-            elif is_out:
-                board.unplug()
-            else:
-                board.plug()
+            fault = faults[(spans.count - 1) % len(faults)] if is_out else ""
+            board.faults = replace(LineFaults(), **({fault: True} if fault not in ("", "unplugged") else {}))
+            (board.unplug if fault == "unplugged" else board.plug)()
             time.sleep(_POLL_S)
         board.await_closing(_CLOSING_S)  # or the reader, which may see the end later, would count a lost port
 
@@ -144,13 +141,14 @@ class _Outages:
     """Spans since the beginning, one after the other; what was slept through comes late and is as long."""
 
     def __init__(self, spans_s: tuple[tuple[float, float], ...]) -> None:
+        self.count = 0  # of those that have begun
         self._left, self._until_s = sorted(spans_s), -math.inf
 
     def is_out(self, since_ns: int) -> bool:
         since_s = since_ns / _NS
         if since_s >= self._until_s and self._left and since_s >= self._left[0][0]:
             begin, end = self._left.pop(0)
-            self._until_s = since_s + end - begin
+            self._until_s, self.count = since_s + end - begin, self.count + 1
         return since_s < self._until_s
 
 
