@@ -23,6 +23,7 @@ from vislam.hw.bridge import frame_gaps, protocol
 from vislam.hw.bridge.behind import Behind
 from vislam.hw.bridge.bridge import SerialBridge, why_not_open
 from vislam.hw.bridge.frame_gaps import FrameGaps
+from vislam.hw.bridge.protocol import Chips
 from vislam.hw.emulator import SensorError
 from vislam.hw.emulator import bridge as emulator
 from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults, at_rest, bridged
@@ -223,7 +224,7 @@ def test_a_restarted_board_gets_a_new_clock_at_once(config: SerialConfig, board:
 
 
 def frame(sequence: int, t_us: int) -> protocol.RawSample:
-    return protocol.RawSample(sequence, t_us, protocol.Status(0), (0, 0, 0), (0, 0, 0), (0, 0, 0), 0)
+    return protocol.RawSample(sequence, t_us, protocol.Status(0), (0, 0, 0), (sequence % 2, 0, 0), (0, 0, 0), 0)
 
 
 @pytest.mark.parametrize("up_us", [20_000_000, 3_000_000_000])
@@ -261,6 +262,9 @@ class ReadBoard:
     def reset_input_buffer(self) -> None:
         self._kept()
 
+    def restart(self) -> None:
+        self._sequence = 0
+
     def received(self, _descriptor: int, _timeout_s: float) -> bytes:
         self.now_ns = max(self.now_ns, self._due_ns)
         return self._kept()
@@ -270,7 +274,8 @@ class ReadBoard:
         while self._due_ns <= self.now_ns:
             t_us = round(self._sequence * PERIOD_NS * 1.01) // 1000  # its clock runs fast
             sample = frame(self._sequence, t_us)
-            frames.append(sample if self._sequence else replace(bridged("GY-85").hello, sequence=0, t_us=0))
+            hello = replace(bridged("GY-85").hello, sequence=0, t_us=0, chips=Chips(7) | Chips.STARTED)
+            frames.append(sample if self._sequence else hello)
             self._sequence, self._due_ns = self._sequence + 1, self._due_ns + PERIOD_NS
         return b"".join(map(protocol.encode, frames[:640]))
 
@@ -284,14 +289,20 @@ def read_board(monkeypatch: pytest.MonkeyPatch) -> ReadBoard:
     return board
 
 
-def test_a_host_that_was_busy_stamps_as_if_it_had_not_been(config: SerialConfig, read_board: ReadBoard) -> None:
+@pytest.mark.parametrize("began_again", [False, True])
+def test_a_host_that_was_busy_stamps_as_if_it_had_not_been(
+    config: SerialConfig, read_board: ReadBoard, began_again: bool
+) -> None:
     bridge = SerialBridge(config)
-    samples = collect(bridge, lambda found: len(found) > 300)
+    before = imu(collect(bridge, lambda found: len(found) > 300))
+    if began_again:
+        read_board.restart()
     read_board.now_ns += 200_000_000
-    samples += collect(bridge, lambda found: len(found) > 300)
+    after = imu(collect(bridge, lambda found: len(found) > 300))
     assert bridge.counters().get("frames_lost", 0) == 0
-    intervals = np.diff([sample.t_ns for sample in imu(samples)])
-    assert intervals == pytest.approx(PERIOD_NS, rel=1e-3)
+    samples = after if began_again else [*before, *after]
+    assert np.diff([sample.t_ns for sample in samples]) == pytest.approx(PERIOD_NS, rel=1e-3)
+    assert after[-1].t_ns == pytest.approx(read_board.now_ns, abs=2 * PERIOD_NS)
 
 
 def test_what_lay_in_the_port_for_long_bends_no_stamp_and_is_counted(

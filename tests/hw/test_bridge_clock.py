@@ -114,6 +114,22 @@ def test_a_burst_after_a_long_stall_of_the_host_is_no_step() -> None:
     assert np.abs(stamps - truth - 1e6).max() < 2e6
 
 
+@pytest.mark.parametrize("late", [400, 720])
+def test_stamps_that_a_late_begin_bent_are_taken_back_before_a_hole(late: int) -> None:
+    """Samples of a second or two, from the first on, come one soon after another."""
+    clock = DeviceClock(BridgeClockConfig())
+    true_ns, device_us = run(8000, 0.003)
+    feed(clock, true_ns[:2000], device_us[:2000], delays(2000, 7))
+    clock.restart()
+    waited_ns = np.maximum(true_ns[2000 + late] + np.arange(6000) * 50_000 - true_ns[2000:], 0)
+    stamps, truth = feed(clock, true_ns[2000:], device_us[2000:] - device_us[2000], 1_000_000 + waited_ns)
+    error_ns = np.abs(stamps - truth - 1e6)
+    wrong = np.flatnonzero(error_ns > 3e6)
+    assert len(wrong) < 60
+    assert stamps[wrong[-1] + 1] - stamps[wrong[-1]] > 0.85 * error_ns.max()
+    assert clock.steps == 2
+
+
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1000, 1900))
 def test_one_absurd_stamp_is_left_out(wrong_us: int, at: int) -> None:

@@ -42,6 +42,7 @@ estimators = [{name = "tight", outputs = ["live", "graph"]}]
 SMALLEST = {
     "experiments/aliasing.py": "--worlds panels-2.0 --losses 1 --length-m 9",
     "experiments/breaks.py": "--help",
+    "experiments/cart_ride.py": "--help",
     "experiments/cart_wheels.py": "--seeds 0 --duration-s 12 --blind-at-s 4 --radii 'as told'",
     "experiments/cloud_smoothing.py": "--seconds 0.5",
     "experiments/depth_alone.py": "--source {recording} --dark 0.5 --begin 1 --length 2.5",

@@ -102,12 +102,11 @@ def place_options(text: str) -> PlaceOptions:
             value = "true"
         elif not equals:
             raise UsageError(f"'{part}' is no option of the virtual cart; write virtual-cart,option=value")
-        values[name] = _outages(value) if name.endswith("_out") else value
+        values[name] = _outages(value) if name.endswith("_out") else value.split("/") if name == "imu_fault" else value
     options = validated(PlaceOptions, values, "virtual-cart")
-    if options.imu_fault != "unplugged" and not options.bridge:
-        raise UsageError(
-            f"imu_fault={options.imu_fault} is one of a serial bridge; write virtual-cart,bridge,imu_fault=..."
-        )
+    beyond = [fault for fault in options.imu_fault if fault != "unplugged"]
+    if beyond and not options.bridge:
+        raise UsageError(f"imu_fault={beyond[0]} is one of a serial bridge; write virtual-cart,bridge,imu_fault=...")
     return options
 
 

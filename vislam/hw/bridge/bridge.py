@@ -120,10 +120,10 @@ class SerialBridge:
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the first sample, `timeout_s` at most."""
-        if self._first:
-            first, self._first = self._first, []
-            return first
+        first, self._first = self._first, []
         now = time.monotonic_ns()
+        if first and now - self._newest_ns < 2 * _NS:  # else the others took long to start
+            return first
         deadline = now + round(timeout_s * _NS)
         while True:
             if self._port is None and now >= self._retry_ns:
@@ -239,8 +239,8 @@ class SerialBridge:
             self._lose("port_lost", f"{config.port} went away: {error}; plug it in again")
             return []
         arrival_ns = time.monotonic_ns()
-        bad = self._decoder.bad
-        samples = [one for message in self._decoder.feed(data) for one in self._taken(message, arrival_ns)]
+        bad, found = self._decoder.bad, self._decoder.feed(data)
+        samples = [one for message in found for one in self._taken(message, arrival_ns, message is found[-1])]
         if self._decoder.bad > bad:
             self._events |= Health.BUS_FAULT
         if samples or is_stale:
@@ -251,7 +251,7 @@ class SerialBridge:
         samples.sort(key=lambda sample: sample.t_ns)
         return samples
 
-    def _taken(self, message: Message, arrival_ns: int) -> list[ImuSample | MagSample]:
+    def _taken(self, message: Message, arrival_ns: int, is_last: bool) -> list[ImuSample | MagSample]:
         if isinstance(message, Counts | Passed):
             self._passer.take(message)
             return []
@@ -271,7 +271,7 @@ class SerialBridge:
         if hello is None or not self._behind.is_known:
             self._counts["before_hello"] += 1
             return []
-        return self._sampled(message, hello, arrival_ns)
+        return self._sampled(message, hello, arrival_ns, is_last)
 
     def _greet(self, hello: Hello, arrival_ns: int) -> None:
         """Take what the device states about itself."""
@@ -291,8 +291,8 @@ class SerialBridge:
             self._counts["frames_lost"] += lost or 0
             self._events |= Health.IMU_GAP
 
-    def _sampled(self, raw: RawSample, hello: Hello, arrival_ns: int) -> list[ImuSample | MagSample]:
-        stamp_ns = self._clock.stamp(raw.t_us, arrival_ns - self._behind.line_ns)
+    def _sampled(self, raw: RawSample, hello: Hello, arrival_ns: int, is_last: bool) -> list[ImuSample | MagSample]:
+        stamp_ns = self._clock.stamp(raw.t_us, arrival_ns - self._behind.line_ns, is_last)
         self._note_status(raw, hello)
         if stamp_ns is None:
             self._counts["unstamped"] += 1

@@ -54,8 +54,11 @@ class DeviceClock:
             self.steps += 1
         self._begin()
 
-    def stamp(self, device_us: int, arrival_ns: int) -> int | None:
-        """Return the host time of a device stamp that has just arrived; None while the line is not to be trusted."""
+    def stamp(self, device_us: int, arrival_ns: int, is_newest: bool = True) -> int | None:
+        """Return the host time of a device stamp that has just arrived; None while the line is not to be trusted.
+
+        Of what was read at once only the newest, which the others lay in wait for, shows where a line begins.
+        """
         point = _Point(self._unwrapped(device_us), arrival_ns)
         if self._last is not None and self._delay_ns(point) < -self._step_ns:  # before its time: no delay explains it
             suspect, self._suspect = self._suspect, (device_us, arrival_ns)
@@ -63,9 +66,12 @@ class DeviceClock:
                 self.doubted += 1
                 return None
             self.restart()
-            self._add(_Point(suspect[0] * 1000, suspect[1]))
+            if is_newest:
+                self._add(_Point(suspect[0] * 1000, suspect[1]))
             point = _Point(self._unwrapped(device_us), arrival_ns)
         self._suspect = None
+        if self._last is None and not is_newest:
+            return None
         self._add(point)
         return self._stamped(point) if self._rate_known else None
 
@@ -75,7 +81,7 @@ class DeviceClock:
         For what the device stamped besides, before or after it: within 0.1 s of the newest stamp, and by the same
         slow approach to a better line, so that its intervals stay true as well.
         """
-        if self._last is None or self._slewed is None:
+        if self._last is None or self._slewed is None or self._slewed[0] != self._last.device_ns:
             return None
         since_us = (device_us - self._last.device_ns // 1000 + _WRAP_US // 2) % _WRAP_US - _WRAP_US // 2
         if abs(since_us) > _STEP_S * 1e6:
@@ -105,7 +111,8 @@ class DeviceClock:
     def _add(self, point: _Point) -> None:
         bin_ns = int(self._config.bin_s * 1e9)
         if self._last is None or point.device_ns // bin_ns != self._last.device_ns // bin_ns:
-            self._fit(point.device_ns)
+            if self._last is None or point.host_ns > self._last.host_ns:  # what was read at once shows no rate
+                self._fit(point.device_ns)
             self._lowest.append(point)
         elif self._delay_ns(point) < self._delay_ns(self._lowest[-1]):
             self._lowest[-1] = point
@@ -121,8 +128,8 @@ class DeviceClock:
         if not points:
             return
         self._forget_before_step(now_ns)
-        span_s = (points[-1].device_ns - points[0].device_ns) * 1e-9
-        if span_s >= config.settle_s:
+        seen_ns = min(points[-1].device_ns - points[0].device_ns, points[-1].host_ns - points[0].host_ns)
+        if seen_ns >= config.settle_s * 1e9:
             self._rate_known = True
             self.rate = min(max(_slope_below(list(points)), 1.0 - _MAX_DRIFT), 1.0 + _MAX_DRIFT)
         self._anchor = min(points, key=self._delay_ns)
@@ -143,12 +150,22 @@ class DeviceClock:
             self._slewed = None
 
     def _stamped(self, point: _Point) -> int | None:
-        """Return the line at a point, approached at a limited rate so that intervals between samples stay true."""
+        """Return the line at a point, approached at a limited rate so that intervals between samples stay true.
+
+        Stamps far off a better line are taken back: it begins behind a hole as long as they were wrong.
+        """
         line_ns = self._line_ns(point.device_ns)
         if self._slewed is not None:
             passed_ns = (point.device_ns - self._slewed[0]) * self.rate
-            reach_ns = passed_ns * _MAX_SLEW
-            line_ns = self._slewed[1] + passed_ns + min(max(line_ns - self._slewed[1] - passed_ns, -reach_ns), reach_ns)
+            off_ns, reach_ns = line_ns - self._slewed[1] - passed_ns, passed_ns * _MAX_SLEW
+            if abs(off_ns) < self._step_ns:
+                line_ns = self._slewed[1] + passed_ns + min(max(off_ns, -reach_ns), reach_ns)
+            elif line_ns < self._slewed[1] - off_ns:
+                self.doubted += 1
+                self._lowest = deque(known for known in self._lowest if self._delay_ns(known) < self._step_ns)
+                return None
+            else:
+                self.steps += 1
         stamp_ns = round(line_ns)
         self._slewed = (point.device_ns, stamp_ns)
         if stamp_ns <= self._newest_stamp_ns:

@@ -21,7 +21,7 @@ class FrameGaps:
         Its rate is not known well enough then to compute how long they lay in the port.
         """
         heard_ns, self._heard_ns = self._heard_ns, now_ns
-        return self._last is not None and now_ns - heard_ns > max(_STALE_NS, seen_ns)
+        return self._last is not None and 0 < heard_ns < now_ns - max(_STALE_NS, seen_ns)
 
     def before(self, frame: RawSample | Hello, arrival_ns: int) -> int | None:
         """Return how many frames are missing before this one; None where the device began again.

@@ -37,6 +37,7 @@ _PERIOD_NS = 2_500_000
 _MAG_EVERY = 8
 _COUNTS_EVERY = 8  # samples: 50 a second
 _LATE_NS = 20_000_000
+_MOST_ASIDE_NS = 5 * _NS  # for which its thread may be put aside without loss: the samples come late
 _HELLO_EVERY_NS = _NS
 _READ_NS = 500_000  # from a sample's time to its first byte
 _BOOT_NS = 120_000_000
@@ -162,6 +163,7 @@ class BridgeEmulator:
         self._board = bridged(board)
         self._chips = self._board.hello.chips | (Chips.ENCODERS if turned else 0) | (Chips.GNSS if has_receiver else 0)
         self._said = b""  # by the receiver
+        self._unsent = b""  # that the line has not taken yet
         self._rng = random.Random(seed)
         self._sensing = [Sensing(error, seed + i) for i, error in enumerate(errors)]
         self._lock = threading.Lock()
@@ -184,6 +186,7 @@ class BridgeEmulator:
             if self._master is not None:
                 return
             self._master, slave = pty.openpty()
+            self._unsent = b""
             tty.setraw(slave)
             os.set_blocking(self._master, False)
             self.path.unlink(missing_ok=True)
@@ -255,8 +258,8 @@ class BridgeEmulator:
             taken_ns = min(self._now_ns(), due_ns + _LATE_NS)  # of a thread that was put aside: near its samples
             self._send(frames + further.passed(self._device_us(taken_ns - begin_ns), said))
             due_ns += _PERIOD_NS
-            if self._now_ns() - due_ns > _NS:  # this thread was put aside: the board would have gone on sampling
-                due_ns = self._now_ns()
+            aside = max(self._now_ns() - due_ns - _MOST_ASIDE_NS, 0) // _PERIOD_NS  # the board would have gone on
+            due_ns, sequence, ticks = due_ns + aside * _PERIOD_NS, (sequence + aside) % _SEQUENCES, ticks + aside
 
     def _device_us(self, elapsed_ns: int) -> int:
         return round(elapsed_ns * (1.0 + self._drift)) // 1000 % _WRAP_US
@@ -310,7 +313,7 @@ class BridgeEmulator:
         return self._is_stopping.is_set() or self._restart_asked.is_set()
 
     def _send(self, frames: bytes) -> None:
-        """Put bytes on the wire; what a full line does not take is lost, as in the sketch."""
+        """Put frames on the wire; what a full line does not take is lost whole, as in the sketch."""
         faults = self.faults
         if faults.silent:
             return
@@ -319,7 +322,9 @@ class BridgeEmulator:
         with self._lock:
             if self._master is not None:
                 with suppress(OSError):  # no listener, or the line is full
-                    os.write(self._master, frames)
+                    self._unsent = self._unsent[os.write(self._master, self._unsent) :]
+                    if not self._unsent:
+                        self._unsent = frames[os.write(self._master, frames) :]
 
     def _spoiled(self, frames: bytes, faults: LineFaults) -> bytes:
         if faults.garbage:

@@ -162,7 +162,7 @@ class VirtualCart:
         if self.options.bridge:
             found["board"] = partial(
                 run_board, port=self._port, cart=names[0], epoch=self._epoch, gravity_m_s2=self._gravity_m_s2,
-                seed=self.options.seed, outages=self.options.imu_out, fault=self.options.imu_fault,
+                seed=self.options.seed, outages=self.options.imu_out, faults=self.options.imu_fault,
             )  # fmt: skip
         return found
 

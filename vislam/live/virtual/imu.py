@@ -21,7 +21,7 @@ from vislam.hw.source import InertialSource
 from vislam.hw.timing import Clock, HostClock
 from vislam.live.epoch import Epoch
 from vislam.live.processes.child import Life
-from vislam.live.virtual.motion import Follower, Segment
+from vislam.live.virtual.motion import SEGMENT_S, Follower, Segment
 
 _NS = 1_000_000_000
 _FIELD_UT = (18.2, -10.5, -43.0)  # central Europe, z up
@@ -58,7 +58,7 @@ class VirtualGy85:
             outages: s since the beginning, from and to: unplugged.
             stepped: the clock of a simulation that takes no time; None: that of the host.
         """
-        self._begin_ns, self._outages = begin_ns, outages
+        self._begin_ns, self._outages = begin_ns, _Outages(outages)
         self._clock: Clock = HostClock() if stepped is None else stepped
         self._stack = ExitStack()
         truth = _truth(cart, begin_ns, gravity_m_s2)
@@ -80,7 +80,7 @@ class VirtualGy85:
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what the driver reads."""
-        plugged = not _is_within(self._outages, self._clock.now_ns() - self._begin_ns())
+        plugged = not self._outages.is_out(self._clock.now_ns() - self._begin_ns())
         if plugged != self._is_plugged:
             self._is_plugged = plugged
             (self._board.replug if plugged else self._board.unplug)()
@@ -101,25 +101,22 @@ class VirtualGy85:
 
 def run_board(
     life: Life, port: Path, cart: str, epoch: Epoch, gravity_m_s2: float, seed: int,
-    outages: tuple[tuple[float, float], ...], fault: str,
+    outages: tuple[tuple[float, float], ...], faults: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Be the serial bridge's board on the cart until the run ends; `port` is a link to its pseudo-terminal.
 
-    In each of `outages` it is `unplugged`, or has the fault of that name in `LineFaults`.
+    In each of `outages` it is `unplugged`, or has the fault of that name in `LineFaults`: one of `faults` in turn.
     """
     truth = _truth(Follower.waiting(cart), epoch.peek_ns, gravity_m_s2)
     with BridgeEmulator(port, truth, seed, _DRIFT, gy85_errors(seed)) as board:
         if not life.ready():
             return
-        begin_ns = epoch.begin_ns()
+        begin_ns, spans = epoch.begin_ns(), _Outages(outages)
         while not life.stopped:
-            is_out = _is_within(outages, time.monotonic_ns() - begin_ns)
-            if fault != "unplugged":
-                board.faults = replace(LineFaults(), **{fault: is_out})
-            elif is_out:
-                board.unplug()
-            else:
-                board.plug()
+            is_out = spans.is_out(time.monotonic_ns() - begin_ns)
+            fault = faults[(spans.count - 1) % len(faults)] if is_out else ""
+            board.faults = replace(LineFaults(), **({fault: True} if fault not in ("", "unplugged") else {}))
+            (board.unplug if fault == "unplugged" else board.plug)()
             time.sleep(_POLL_S)
         board.await_closing(_CLOSING_S)  # or the reader, which may see the end later, would count a lost port
 
@@ -140,10 +137,19 @@ def open_gy85(
     return VirtualGy85(Follower.waiting(cart), epoch.peek_ns, config, seed, gravity_m_s2, outages)
 
 
-def _is_within(spans_s: tuple[tuple[float, float], ...], since_ns: int) -> bool:
-    """Return whether a time since the beginning is within one of some spans."""
-    since_s = since_ns / _NS
-    return any(begin <= since_s < end for begin, end in spans_s)
+class _Outages:
+    """Spans since the beginning, one after the other; what was slept through comes late and is as long."""
+
+    def __init__(self, spans_s: tuple[tuple[float, float], ...]) -> None:
+        self.count = 0  # of those that have begun
+        self._left, self._until_s = sorted(spans_s), -math.inf
+
+    def is_out(self, since_ns: int) -> bool:
+        since_s = since_ns / _NS
+        if since_s >= self._until_s and self._left and since_s >= self._left[0][0]:
+            begin, end = self._left.pop(0)
+            self._until_s, self.count = since_s + end - begin, self.count + 1
+        return since_s < self._until_s
 
 
 def _truth(cart: Moved, begin_ns: Callable[[], int], gravity_m_s2: float) -> Truth:
@@ -153,11 +159,12 @@ def _truth(cart: Moved, begin_ns: Callable[[], int], gravity_m_s2: float) -> Tru
         zero_ns = begin_ns()
         since_s = -1.0 if zero_ns == 0 else (t_ns - zero_ns) * 1e-9
         s = cart.segment(since_s)
-        dt = max(since_s - s.t_s, 0.0)
+        beyond = max(since_s - s.t_s - SEGMENT_S, 0.0)
+        dt = max(since_s - s.t_s, 0.0) - beyond
         speed, rate = s.speed_m_s + s.accel_m_s2 * dt, s.rate_rad_s + s.angular_accel_rad_s2 * dt
-        yaw = s.yaw_rad + dt * (s.rate_rad_s + 0.5 * s.angular_accel_rad_s2 * dt)
+        yaw = s.yaw_rad + dt * (s.rate_rad_s + 0.5 * s.angular_accel_rad_s2 * dt) + rate * beyond
         c, n = math.cos(yaw), math.sin(yaw)
-        accel = s.accel_m_s2 if since_s > 0.0 else 0.0
+        accel = s.accel_m_s2 if since_s > 0.0 and beyond == 0.0 else 0.0
         field = (c * _FIELD_UT[0] + n * _FIELD_UT[1], c * _FIELD_UT[1] - n * _FIELD_UT[0], _FIELD_UT[2])
         return (0.0, 0.0, rate), (accel, speed * rate, gravity_m_s2), field, _WARM_C
 

@@ -1,7 +1,8 @@
 """How the virtual cart moves: a unicycle whose wheels follow commands, exact at every instant and in every process.
 
 Time is cut into segments of constant accelerations, decided a little ahead. The process that steers publishes the last
-seconds of them; all that need the truth (chips, camera, evaluation) evaluate the same segments, so all agree.
+seconds of them; all that need the truth (chips, camera, evaluation) evaluate the same segments, so all agree. Where
+that process is put aside the wheels turn on as they do, and what others have sensed meanwhile stays true.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from vislam.live.wire.slot import SlotReader, SlotWriter, wait_for
 SEGMENT_S = 0.05
 LEAD = 2  # segments decided ahead: a command takes 0.1 to 0.15 s to act, as on a real cart
 _KEPT = 120  # segments that are published: 6 s
+_ROUNDING_S = 1e-9
 _COLUMNS = 8
 _FIRST_S = 60.0  # that a follower waits for the first one
 _GAUSS = np.polynomial.legendre.leggauss(4)  # over 50 ms at 1 rad/s its error is below a nanometre
@@ -39,8 +41,14 @@ class Segment:
     angular_accel_rad_s2: float
 
     def at(self, t_s: float) -> Segment:
-        """Return the cart at a time of this segment (or just beyond it)."""
+        """Return the cart at a time of this segment, or beyond it, where it goes on without acceleration."""
         dt = t_s - self.t_s
+        if dt <= SEGMENT_S + _ROUNDING_S:
+            return self._after(dt, t_s)
+        end = self._after(SEGMENT_S, self.t_s + SEGMENT_S)
+        return replace(end, accel_m_s2=0.0, angular_accel_rad_s2=0.0)._after(dt - SEGMENT_S, t_s)
+
+    def _after(self, dt: float, t_s: float) -> Segment:
         speed, rate = self.speed_m_s + self.accel_m_s2 * dt, self.rate_rad_s + self.angular_accel_rad_s2 * dt
         nodes, weights = 0.5 * dt * (_GAUSS[0] + 1.0), 0.5 * dt * _GAUSS[1]
         yaws = self.yaw_rad + nodes * (self.rate_rad_s + 0.5 * self.angular_accel_rad_s2 * nodes)
@@ -76,7 +84,10 @@ class Drive:
         self._publish()
 
     def advance(self, now_s: float, speed_m_s: float, rate_rad_s: float) -> list[Segment]:
-        """Decide segments until `LEAD` ahead of now, towards the commanded twist; return the new ones."""
+        """Decide segments until `LEAD` ahead of now, towards the commanded twist; return the new ones.
+
+        What has passed undecided, and what may pass until it is published, goes on without acceleration.
+        """
         new = []
         while self._segments[-1].t_s < now_s + LEAD * SEGMENT_S:
             w, old = self._wheels, self._segments[-1]
@@ -86,6 +97,8 @@ class Drive:
             accel = np.clip((wanted - end.speed_m_s) / SEGMENT_S, -w.max_accel_m_s2, w.max_accel_m_s2)
             limit = w.max_angular_accel_rad_s2
             spin = np.clip((turning - end.rate_rad_s) / SEGMENT_S, -limit, limit)
+            if end.t_s < now_s + SEGMENT_S - _ROUNDING_S:
+                accel = spin = 0.0
             new.append(replace(end, accel_m_s2=float(accel), angular_accel_rad_s2=float(spin)))
             self._segments.append(new[-1])
         if new:

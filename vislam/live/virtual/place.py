@@ -40,8 +40,8 @@ class PlaceOptions:
     steered: bool = False  # by commands; without a new one for 0.3 s it stops
     seed: int = 0
     bridge: bool = False  # its IMU is a board on a serial port, else on I2C
-    # what happens in `imu_out`; all but the first with `bridge` alone
-    imu_fault: Literal["unplugged", "silent", "garbage", "no_gyro", "no_accel", "frozen"] = "unplugged"
+    # what happens in `imu_out`, one after the other; all but the first with `bridge` alone
+    imu_fault: tuple[Literal["unplugged", "silent", "garbage", "no_gyro", "no_accel", "frozen"], ...] = ("unplugged",)
     imu_out: tuple[tuple[float, float], ...] = ()  # s since the beginning: from, to
     camera_out: tuple[tuple[float, float], ...] = ()
 
