@@ -118,6 +118,7 @@ def _gltf(
     pictures: dict[str, object] = {}
     if len(sizes) > len(parts):
         # light is in the pictures already; viewers that do not know the extension light them again
+        materials[0]["extensions"] = {_UNLIT: {}}
         materials.append({
             "doubleSided": True, "extensions": {_UNLIT: {}},
             "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, **plain},
