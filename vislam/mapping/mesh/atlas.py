@@ -13,8 +13,9 @@ from scipy.sparse.csgraph import connected_components
 
 from vislam.core.messages import Array, ImageU8
 from vislam.mapping.cloud.mesh import Mesh
-from vislam.mapping.mesh.choice import MARGIN_PX, WHITE, Faces, chosen_views, neighbours, scores
+from vislam.mapping.mesh.choice import MARGIN_PX, WHITE, Faces, chosen_views, scores
 from vislam.mapping.mesh.drawing import draw, seen_at
+from vislam.mapping.mesh.edges import neighbours
 from vislam.mapping.mesh.exposure import exposure_gains
 from vislam.mapping.mesh.posed import PosedView
 from vislam.mapping.mesh.seams import offsets
@@ -36,12 +37,14 @@ class TexturedMesh:
     triangles: NDArray[np.int32]  # [M, 3]
     atlas: ImageU8  # [H, W, 3] RGB
     rest: Mesh  # what no view saw
+    filled: int = 0  # of the last triangles, how many close holes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Charts:
     """Connected triangles that show one view, and their corners: a point on a border is one of each chart."""
 
+    number: I64  # [M] of the triangles in the mesh
     of_triangle: I64  # [M]
     view: I64  # [C]
     of_corner: I64  # [P]
@@ -91,7 +94,9 @@ def textured(mesh: Mesh, views: Callable[[], Iterable[PosedView]], size_px: int)
             atlas[y : y + h, x : x + w] = cv2.resize(part, (int(w), int(h)), interpolation=cv2.INTER_AREA)
     uv = (pixels + 0.5 - low[charts.of_corner]) * (sizes / (high - low))[charts.of_corner] + places[charts.of_corner]
     uv = (uv / [size_px, height]).astype(np.float32)
-    return TexturedMesh(points, uv, charts.triangles, atlas, mesh.select(chosen < 0))
+    is_filled = charts.number >= len(mesh.triangles) - mesh.filled
+    triangles = charts.triangles[np.argsort(is_filled, kind="stable")]
+    return TexturedMesh(points, uv, triangles, atlas, mesh.select(chosen < 0), int(is_filled.sum()))
 
 
 def _between(pixels: Array, values: Array, triangles: I64, size: tuple[int, int]) -> Array:
@@ -129,6 +134,7 @@ def _charts(mesh: Mesh, chosen: NDArray[np.int32], pairs: I64) -> _Charts:
         chart[order, None] * len(mesh.points_m) + mesh.triangles[seen[order]], return_inverse=True
     )
     return _Charts(
+        seen[order],
         chart[order], chosen[seen[first]].astype(np.int64), keys // len(mesh.points_m), keys % len(mesh.points_m),
         corners.reshape(-1, 3).astype(np.int32),
     )  # fmt: skip

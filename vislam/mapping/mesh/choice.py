@@ -221,16 +221,6 @@ def _settled(best: F32, view: I32, pairs: I64, start: I32 | None = None) -> I32:
     return out
 
 
-def neighbours(triangles: I32) -> I64:
-    """Return the pairs [E, 2] of triangles that share an edge."""
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    owner = np.tile(np.arange(len(triangles)), 3)
-    order = np.lexsort((owner, edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    same = (edges[1:] == edges[:-1]).all(axis=1)
-    return np.column_stack([owner[:-1][same], owner[1:][same]])
-
-
 def chosen_views(faces: Faces, pairs: I64, views: Callable[[], Iterable[PosedView]], gains: Array) -> I32:
     """Return the view of each triangle [M], -1 where none sees it, by neighbours [E, 2] and gains of views [V, 3].
 
