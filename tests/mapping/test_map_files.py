@@ -110,6 +110,21 @@ def test_a_mesh_is_read_back(tmp_path):
         assert got.dtype == wrote.dtype
 
 
+def test_what_fills_holes_is_marked_in_every_format(tmp_path):
+    mesh = replace(square(), filled=1)
+    write_ply(tmp_path / "a.ply", mesh.points_m, mesh.colors, mesh.triangles, filled=1)
+    np.testing.assert_array_equal(read_ply_mesh(tmp_path / "a.ply")[2], mesh.triangles)
+    assert (tmp_path / "a.ply").read_bytes()[-1] == 1  # of the last triangle
+    assert b"property uchar filled" in (tmp_path / "a.ply").read_bytes()
+    write_obj(tmp_path / "a.obj", mesh)
+    assert (tmp_path / "a.obj").read_text().endswith("g seen\nf 1 2 3\ng filled\nf 1 3 4\n")
+    write_glb(tmp_path / "a.glb", mesh)
+    data = (tmp_path / "a.glb").read_bytes()
+    seen, closes = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])["meshes"][0]["primitives"]
+    assert "extras" not in seen
+    assert closes["extras"] == {"filled": True}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -172,7 +172,7 @@ def _write_mesh(path: Path, mesh: Mesh | None, reason: str) -> str | None:
     if path.suffix == ".obj":
         write_obj(path, mesh)
     else:
-        write_ply(path, mesh.points_m, mesh.colors, mesh.triangles)
+        write_ply(path, mesh.points_m, mesh.colors, mesh.triangles, filled=mesh.filled)
     return None
 
 

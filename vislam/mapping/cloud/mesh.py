@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from vislam.core.geometry import invert
 from vislam.mapping._open3d import load_open3d
 from vislam.mapping.cloud.surfels import Surfels
+from vislam.mapping.mesh.mended import filled, flattened
 from vislam.mapping.mesh.posed import PosedView
 from vislam.mapping.mesh.volume import Volume
 
@@ -31,11 +32,13 @@ class Mesh:
     points_m: NDArray[np.float32]  # [N, 3]
     colors: NDArray[np.uint8]  # [N, 3] RGB
     triangles: NDArray[np.int32]  # [M, 3] counter-clockwise from outside
+    filled: int = 0  # of the last triangles, how many close holes, where nothing was seen
 
     def select(self, chosen: NDArray[np.bool_]) -> Mesh:
         """Return the chosen triangles [M] with the points that they have, in the same order."""
         used, triangles = np.unique(self.triangles[chosen], return_inverse=True)
-        return Mesh(self.points_m[used], self.colors[used], triangles.reshape(-1, 3).astype(np.int32))
+        left = int(chosen[len(chosen) - self.filled :].sum())
+        return Mesh(self.points_m[used], self.colors[used], triangles.reshape(-1, 3).astype(np.int32), left)
 
 
 def fuse_mesh(
@@ -44,9 +47,9 @@ def fuse_mesh(
 ) -> tuple[Mesh | None, str]:  # fmt: skip
     """Return the mesh of views, and an empty string; or None and the reason there is none.
 
-    Triangles with a vertex where `is_false`, given the volume and vertices [N, 3], finds no surface,
-    are left out. When the mesh takes more than `max_blocks` of voxels, the views are asked for again, and voxels are
-    larger.
+    Triangles with a vertex where `is_false`, given the volume and vertices [N, 3], finds no surface, are left out.
+    Small holes are filled, and flat surfaces are flat. When the mesh takes more than `max_blocks` of voxels, the views
+    are asked for again, and voxels are larger.
     """
     open3d, reason = load_open3d()
     if open3d is None:
@@ -62,7 +65,14 @@ def fuse_mesh(
     mesh = _sorted(points, np.clip(np.round(colors * 255.0), 0, 255).astype(np.uint8), triangles)
     if is_false is not None:
         mesh = mesh.select(np.asarray(~is_false(volume, mesh.points_m)[mesh.triangles].any(axis=1)))
-    return (mesh, "") if len(mesh.triangles) else (None, "later rays passed through every surface that was seen")
+    if len(mesh.triangles) == 0:
+        return None, "later rays passed through every surface that was seen"
+
+    def is_open(places: NDArray[np.float32]) -> NDArray[np.bool_]:
+        free = volume.is_free(places)
+        return free if is_false is None else free | is_false(volume, places)
+
+    return flattened(open3d, filled(mesh, is_open)), ""
 
 
 def _fused(open3d: Any, views: Iterable[PosedView], voxel_m: float, max_blocks: int) -> Volume | None:

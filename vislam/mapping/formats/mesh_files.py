@@ -47,10 +47,10 @@ def write_glb(path: Path, mesh: Mesh, textured: TexturedMesh | None = None) -> N
     primitives: list[dict[str, object]] = []
     if textured is not None:
         uv = _Part(textured.uv, "<f4", _FLOAT, "VEC2", _VERTICES)
-        primitives.append(_primitive(parts, textured.points_m, "TEXCOORD_0", uv, textured.triangles, 1))
+        primitives += _primitives(parts, textured.points_m, ("TEXCOORD_0", uv), textured.triangles, textured.filled, 1)
     if textured is None or len(rest.triangles):
         colors = _Part(rest.colors, "u1", _UNSIGNED_BYTE, "VEC4", _VERTICES)
-        primitives.append(_primitive(parts, rest.points_m, "COLOR_0", colors, rest.triangles, 0))
+        primitives += _primitives(parts, rest.points_m, ("COLOR_0", colors), rest.triangles, rest.filled, 0)
     picture = b"" if textured is None else _jpeg(textured.atlas)
     sizes = [len(part.rows) * _row_bytes(part) for part in parts] + ([len(picture)] if picture else [])
     padding = b"\0" * (-sum(sizes) % 4)
@@ -67,15 +67,23 @@ def write_glb(path: Path, mesh: Mesh, textured: TexturedMesh | None = None) -> N
         file.write(picture + padding)
 
 
-def _primitive(
-    parts: list[_Part], points_m: NDArray[np.float32], name: str, attribute: _Part, triangles: NDArray[np.int32],
-    material: int,
-) -> dict[str, object]:  # fmt: skip
-    """Add points, their attribute and triangles to the parts of a file, and return what glTF states of them."""
-    first = len(parts)
-    corners = _Part(triangles.reshape(-1, 1), "<u4", _UNSIGNED_INT, "SCALAR", _INDICES)
-    parts += [_Part(points_m, "<f4", _FLOAT, "VEC3", _VERTICES), attribute, corners]
-    return {"attributes": {"POSITION": first, name: first + 1}, "indices": first + 2, "material": material}
+def _primitives(
+    parts: list[_Part], points_m: NDArray[np.float32], attribute: tuple[str, _Part], triangles: NDArray[np.int32],
+    filled: int, material: int,
+) -> list[dict[str, object]]:  # fmt: skip
+    """Add points, their attribute and triangles to the parts of a file, and return what glTF states of them.
+
+    What fills holes is stated apart from what was seen, and named.
+    """
+    first, seen = len(parts), len(triangles) - filled
+    parts += [_Part(points_m, "<f4", _FLOAT, "VEC3", _VERTICES), attribute[1]]
+    out: list[dict[str, object]] = []
+    for rows, extras in ((triangles[:seen], {}), (triangles[seen:], {"extras": {"filled": True}})):
+        if len(rows):
+            attributes = {"POSITION": first, attribute[0]: first + 1}
+            out.append({"attributes": attributes, "indices": len(parts), "material": material, **extras})
+            parts.append(_Part(rows.reshape(-1, 1), "<u4", _UNSIGNED_INT, "SCALAR", _INDICES))
+    return out
 
 
 def _row_bytes(part: _Part) -> int:
@@ -118,6 +126,7 @@ def _gltf(
     pictures: dict[str, object] = {}
     if len(sizes) > len(parts):
         # light is in the pictures already; viewers that do not know the extension light them again
+        materials[0]["extensions"] = {_UNLIT: {}}
         materials.append({
             "doubleSided": True, "extensions": {_UNLIT: {}},
             "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, **plain},
@@ -143,11 +152,17 @@ def _gltf(
 
 
 def write_obj(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as OBJ, colours behind the coordinates; raises StorageError when the file cannot be written."""
+    """Write a mesh as OBJ, colours behind the coordinates, what fills holes as a group.
+
+    Raises StorageError when the file cannot be written.
+    """
     with replacing(path) as file:
         file.write(b"# vislam, metres in the map frame\n")
         for chunk in chunks(len(mesh.points_m)):
             rows = np.column_stack([mesh.points_m[chunk], mesh.colors[chunk] / 255.0])
             np.savetxt(file, rows, "v %.5f %.5f %.5f %.4f %.4f %.4f")
-        for chunk in chunks(len(mesh.triangles)):
-            np.savetxt(file, mesh.triangles[chunk] + 1, "f %d %d %d")
+        seen = len(mesh.triangles) - mesh.filled
+        for name, triangles in (("seen", mesh.triangles[:seen]), ("filled", mesh.triangles[seen:])):
+            file.write(f"g {name}\n".encode() if mesh.filled else b"")
+            for chunk in chunks(len(triangles)):
+                np.savetxt(file, triangles[chunk] + 1, "f %d %d %d")

@@ -23,6 +23,8 @@ _MAX_LINE_BYTES = 1024
 _VERTEX: list[Any] = [("xyz", "<f4", 3), ("rgb", "u1", 3)]
 _FACE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 _FACE_PROPERTY = "property list uchar int vertex_indices"
+_FILLED_PROPERTY = "property uchar filled"  # 1: the triangle closes a hole, nothing was seen there
+_FILLED_FACE = np.dtype([*_FACE.descr, ("filled", "u1")])
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -37,17 +39,20 @@ def write_ply(
     colors: Colors,
     triangles: NDArray[np.int32] | None = None,
     extra: Mapping[str, NDArray[Any]] | None = None,
+    filled: int = 0,
 ) -> None:
     """Write points [N, 3] with RGB colours [N, 3], and triangles [M, 3] of vertex indices if it is a mesh.
 
     `extra` are further properties [N] by name, such as `nx`, `ny`, `nz` or `radius`: uint16 as ushort, int32 as int,
-    all else as float. Raises StorageError when the file cannot be written.
+    all else as float. Where some of the last triangles are `filled`, each has that property.
+    Raises StorageError when the file cannot be written.
     """
     extra = {} if extra is None else extra
     kinds = {name: _EXTRA.get(values.dtype.name, "float") for name, values in extra.items()}
     vertex = np.dtype([*_VERTEX, *((name, _TYPES[kind]) for name, kind in kinds.items())])
     further = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
     faces = "" if triangles is None else f"element face {len(triangles)}\n{_FACE_PROPERTY}\n"
+    faces += f"{_FILLED_PROPERTY}\n" if filled else ""
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment vislam, metres in the map frame\n"
         f"element vertex {len(points_m)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -63,8 +68,10 @@ def write_ply(
             file.write(rows.tobytes())
         if triangles is not None:
             for chunk in chunks(len(triangles)):
-                faces_out = np.empty(chunk.stop - chunk.start, _FACE)
+                faces_out = np.empty(chunk.stop - chunk.start, _FILLED_FACE if filled else _FACE)
                 faces_out["corners"], faces_out["vertices"] = 3, triangles[chunk]
+                if filled:
+                    faces_out["filled"] = np.arange(chunk.start, chunk.stop) >= len(triangles) - filled
                 file.write(faces_out.tobytes())
 
 
@@ -132,10 +139,12 @@ def _read_face_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void
     lines = _header_lines(file, path)
     start = next((i for i, line in enumerate(lines) if line.startswith("element face ")), -1)
     number = lines[start].removeprefix("element face ")
-    if start < 0 or lines[start + 1 :] != [_FACE_PROPERTY, "end_header"] or not number.isdecimal() or len(number) > 12:
+    known = {(_FACE_PROPERTY, "end_header"): _FACE, (_FACE_PROPERTY, _FILLED_PROPERTY, "end_header"): _FILLED_FACE}
+    face = known.get(tuple(lines[start + 1 :]))
+    if start < 0 or face is None or not number.isdecimal() or len(number) > 12:
         raise DataError(f"{path}: after the vertices must come 'element face COUNT' and '{_FACE_PROPERTY}' alone")
     file.seek(vertices_at + count * vertex.itemsize)
-    return int(number), _FACE
+    return int(number), face
 
 
 def _header_lines(file: BinaryIO, path: Path) -> list[str]:

@@ -28,6 +28,8 @@ def exposure_gains(seen: Sequence[tuple[NDArray[np.int64], ImageU8]], count: int
         seen: of each view, which of the places it sees, and their colours [M, 3].
         count: of the places.
     """
+    if not seen:
+        return np.ones((0, 3))
     place = np.concatenate([places for places, _ in seen])
     view = np.repeat(np.arange(len(seen)), [len(places) for places, _ in seen])
     colors = np.concatenate([of_view for _, of_view in seen]).astype(np.float64)

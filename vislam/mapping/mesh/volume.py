@@ -28,6 +28,7 @@ _MIN_FACING = 0.15  # cosine between ray and surface; a more grazing ray is take
 _SIDES_RATIO = 0.02  # neighbouring pixels of one surface differ by less than this share of depth
 _BEHIND_SHARE = 0.5  # of the weight, behind the surface at the end of the truncation: what is there is unseen
 _MAX_WEIGHT = 1e4
+_FREE_VOXELS = 2.0  # before the nearest surface that was seen
 
 
 class _Image(NamedTuple):
@@ -111,6 +112,14 @@ class Volume:
 
     def views_of(self, points_m: F32) -> NDArray[np.int64]:
         """Return how many views [N] the voxels nearest to points [N, 3] have, 0 outside of all blocks."""
+        return self._nearest(points_m, self._arrays()[3]).astype(np.int64)
+
+    def is_free(self, points_m: F32) -> NDArray[np.bool_]:
+        """Return whether views saw the voxels nearest to points [N, 3] well before any surface."""
+        return self._nearest(points_m, self._arrays()[0]) > _FREE_VOXELS * self.voxel_m
+
+    def _nearest(self, points_m: F32, values: F32) -> F32:
+        """Return the value [N] of the voxels [M, 512] nearest to points [N, 3], 0 outside of all blocks."""
         voxels = np.round(points_m.astype(np.float64) / self.voxel_m).astype(np.int64)
         block, inside = voxels // _BLOCK, voxels % _BLOCK
         keys, of_key = np.unique(block, axis=0, return_inverse=True)
@@ -118,7 +127,7 @@ class Volume:
         is_known = found.numpy()[of_key.ravel()]
         row = np.where(is_known, rows.numpy()[of_key.ravel()], 0)
         index = inside @ np.array([1, _BLOCK, _BLOCK * _BLOCK])
-        return np.where(is_known, self._arrays()[3][row, index], 0.0).astype(np.int64)
+        return np.where(is_known, values[row, index], np.float32(0.0))
 
     def _arrays(self) -> tuple[F32, F32, F32, F32]:
         shared = {name: self._grid.attribute(name).numpy() for name in ("tsdf", "weight", "color", "views")}
