@@ -225,6 +225,11 @@ def edit_manifest(out: Path) -> None:
     (out / "manifest.json").write_text(json.dumps(manifest))
 
 
+def rename_source(out: Path, source: str) -> None:
+    manifest = json.loads((out / "manifest.json").read_text())
+    (out / "manifest.json").write_text(json.dumps(manifest | {"source": source}))
+
+
 def edit_session(out: Path, statement: str) -> None:
     with editing(out / "session.db") as database:
         database.execute(statement)
@@ -237,6 +242,7 @@ def edit_session(out: Path, statement: str) -> None:
         (lambda out: (out / "config.json").write_text("{"), 3, "cannot be read"),
         (edit_config, 2, "was changed since the run began"),
         (edit_manifest, 3, "is not the recording"),
+        (lambda out: rename_source(out, "x" * 10**5), 3, "cannot be looked at: File name too long"),
         (lambda out: (out / "session.db").write_bytes(b"no database at all " * 400), 3, "cannot be read"),
         (lambda out: edit_session(out, "PRAGMA user_version=2"), 3, "format 2, this vislam reads 8"),
         (lambda out: edit_session(out, "DELETE FROM windows WHERE id = 3"), 3, "run the recording again"),

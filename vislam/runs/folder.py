@@ -212,8 +212,12 @@ def manifest(source: str, command: list[str], config: Config) -> dict[str, Any]:
 
 
 def _fingerprint_of(source: str) -> str | None:
-    path = recorded_path(source)
-    return None if path is None else fingerprint(path)
+    try:
+        path = recorded_path(source)
+        return None if path is None else fingerprint(path)
+    except (OSError, ValueError) as error:  # a name that can be no file's
+        why = getattr(error, "strerror", error)
+        raise DataError(f"the recording {source[:200]} cannot be looked at: {why}") from error
 
 
 def fingerprint(path: Path) -> str | None:
