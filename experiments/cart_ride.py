@@ -26,8 +26,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from vislam.config import SensorsConfig, load
-from vislam.core.messages import Array
-from vislam.hw.health import Health
+from vislam.core import Array
+from vislam.hw import Health
 from vislam.live.run_live import LiveRun
 from vislam.live.sources import open_live
 from vislam.live.wire.publisher import PoseListener
@@ -114,20 +114,14 @@ def ride(out: Path, end_s: float, faults: list[Fault], seed: int = 0) -> Ride:
         asked += f",{option}=" + "/".join(f"{fault.from_s}:{fault.to_s}" for fault in chosen) if chosen else ""
     asked += ",imu_fault=" + "/".join(fault.kind for fault in of_board) if of_board else ""
     source, config = open_live(asked, base, SensorsConfig())
-    listener, poses, ended, since = (
-        PoseListener(at),
-        list[_Kept](),
-        threading.Event(),
-        list[int](),
-    )
+    listener, ended = PoseListener(at), threading.Event()
+    poses, since = list[_Kept](), list[int]()
 
     def hear() -> None:
         while (heard := listener.next(0.5)) is not None or not ended.is_set():
             if heard is not None:
-                variance, said = (
-                    float(np.trace(heard.pose_covariance[:3, :3])),
-                    (int(heard.health), heard.reset_counter),
-                )
+                variance = float(np.trace(heard.pose_covariance[:3, :3]))
+                said = int(heard.health), heard.reset_counter
                 poses.append((heard.sequence, heard.t_ns, *said, variance, heard.T_odom_base))
 
     def until_it_sees_again(run: LiveRun) -> None:

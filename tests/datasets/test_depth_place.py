@@ -11,13 +11,12 @@ import pytest
 
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_exp, se3_log
-from vislam.datasets import open_dataset, survey
+from vislam.datasets import Problems, open_dataset, survey
 from vislam.datasets.calibration_text import camera_text, depth_keys_text
 from vislam.datasets.extrinsics import misplaced_depth
 from vislam.datasets.images import DepthFormat
-from vislam.datasets.inspect import inspect
-from vislam.datasets.rgbd import PlaceFit, fit_place, misplaced
-from vislam.datasets.stream import with_depth_format
+from vislam.datasets.rgbd import PlaceFit, fit_place, misplaced, rgbd_findings
+from vislam.datasets.stream import frame_table, with_depth_format
 from vislam.vision.depth_registration import DepthCamera
 
 COLOR = Camera(320, 240, 260.0, 260.0, 159.5, 119.5, 0.0, "radtan", (0.1, -0.05, 0.0, 0.0))
@@ -89,7 +88,8 @@ def test_all_is_found_together_from_starts_that_are_off(tmp_path: Path, monkeypa
     (found.root / "sensor.yaml").write_text(camera_text(COLOR, None, "drawn"))
     for room in ("rgbd.judgement", "extrinsics"):  # it was found above
         monkeypatch.setattr(f"vislam.datasets.{room}.misplaced", lambda *_: fit)
-    (said,) = (f for f in inspect(str(found.root)).findings if f.where == "depth0" and f.severity != "ok")
+    found = survey(str(found.root))
+    (said,), _ = rgbd_findings(found, frame_table(found, Problems()), lambda *_: None)
     assert "does not lie where it is stated to be: depth sits at 4" in said.what and "calibrate rgbd" in said.next_step
     assert misplaced_depth(open_dataset(str(found.root))) == f"{said.what}: {said.next_step}"
 
