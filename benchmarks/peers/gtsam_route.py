@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 
 from vislam.batch import PoseGraphProblem
-from vislam.batch.posegraph.points import turned_by
 from vislam.batch.posegraph.solver import Descent
+from vislam.batch.posegraph.structure import turned_by
 from vislam.core import Array
 
 _ANCHOR_SIGMA = 1e-4  # rad and m: tight, yet far from where gtsam 4.3 calls a system indeterminate
