@@ -9,8 +9,7 @@ from vislam.core.late import late
 if TYPE_CHECKING:
     from vislam.batch.bundle.bundle_adjustment import BatchResult, optimize_run
     from vislam.batch.bundle.loops import LoopVerdict
-    from vislam.batch.posegraph.files import read_pose_graph, write_pose_graph
-    from vislam.batch.posegraph.graph_file import PoseGraphFile
+    from vislam.batch.posegraph.files import PoseGraphFile, read_pose_graph, write_pose_graph
     from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
     from vislam.batch.posegraph.problem import PoseGraphProblem
     from vislam.batch.posegraph.worlds import (
@@ -47,7 +46,7 @@ __getattr__ = late(
         "BatchResult optimize_run": "vislam.batch.bundle.bundle_adjustment",
         "DaskTeam dask_client": "vislam.core.cluster",
         "LoopVerdict": "vislam.batch.bundle.loops",
-        "PoseGraphFile": "vislam.batch.posegraph.graph_file",
+        "PoseGraphFile": "vislam.batch.posegraph.files",
         "read_pose_graph write_pose_graph": "vislam.batch.posegraph.files",
         "PoseGraphSolution optimize_pose_graph": "vislam.batch.posegraph.optimize",
         "PoseGraphProblem": "vislam.batch.posegraph.problem",
