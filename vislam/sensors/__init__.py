@@ -9,8 +9,7 @@ from vislam.sensors.correlated import Correlated
 from vislam.sensors.linear import Linear, SensorError, derived, linearised, wrong_jacobians
 from vislam.sensors.registry import kind_class, register
 from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
-from vislam.sensors.suite import Suite
-from vislam.sensors.toml import SensorFile, SensorSetup, load_sensor_setup
+from vislam.sensors.toml import SensorFile, SensorSetup, Suite, load_sensor_setup
 
 if TYPE_CHECKING:
     from vislam.sensors.simulated import Faults, drawn_readings
