@@ -13,9 +13,8 @@ from vislam.core.geometry import invert, se3_exp, transform_points
 from vislam.core.messages import Array, LoopDecision
 from vislam.loop.candidates import AppearanceCandidates, islands, odometry_candidates, view_bounds
 from vislam.loop.closer import PoseTable
-from vislam.loop.verification.checks import judge, tilt_error_rad
 from vislam.loop.verification.likeness import Likeness
-from vislam.loop.verification.verifier import Verification
+from vislam.loop.verification.verifier import Verification, judge, tilt_error_rad
 from worlds.landmarks import body_pose, make_rig
 
 CONFIG = LoopConfig()
