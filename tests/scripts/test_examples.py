@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from experiment.tiny import jobs_here
-from vislam.sensors import registry
+from vislam.sensors import kinds
 from vislam.sensors.toml import sensor_setup
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -53,7 +53,7 @@ def test_every_kind_of_sensor_has_its_example_and_its_page_names_it():
     spec = importlib.util.spec_from_file_location("further_sensors", ROOT / "examples" / "11_further_sensors.py")
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    assert set(example.KINDS) == set(registry._BUILT_IN)
+    assert set(example.KINDS) == set(kinds._BUILT_IN)
     for kind, (lines, rate_hz) in example.KINDS.items():
         table = tomllib.loads(f'[sensors.it]\nkind = "{kind}"\nsimulated_hz = {rate_hz}\n{lines}\n')
         assert sensor_setup(table, kind, ROOT).simulated_hz == {"it": rate_hz}

@@ -10,7 +10,7 @@ import pytest
 
 from vislam.sensors import BodyState, linearised
 from vislam.sensors.gnss import GnssSettings
-from vislam.sensors.registry import _BUILT_IN, kind_class
+from vislam.sensors.kinds import _BUILT_IN, kind_class
 from vislam.sensors.simulated import drawn_readings
 from vislam.sensors.ticks import TicksSettings
 from vislam.sensors.toml import sensor_setup

@@ -13,8 +13,7 @@ from vislam.config.ranges import Positive
 from vislam.core.errors import UsageError, VislamError
 from vislam.core.messages import Array
 from vislam.sensors import BodyState, Configured, kind_class, load_sensor_setup, register
-from vislam.sensors.kinds import AnchorRange, Wheels
-from vislam.sensors.registry import _BUILT_IN, KINDS
+from vislam.sensors.kinds import _BUILT_IN, KINDS, AnchorRange, Wheels
 from vislam.sensors.toml import sensor_setup
 
 GOOD = """

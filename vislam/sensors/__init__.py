@@ -6,8 +6,8 @@ from vislam.core.late import late
 from vislam.sensors.body import BodyState
 from vislam.sensors.configured import Configured
 from vislam.sensors.correlated import Correlated
+from vislam.sensors.kinds import kind_class, register
 from vislam.sensors.linear import Linear, SensorError, derived, linearised, wrong_jacobians
-from vislam.sensors.registry import kind_class, register
 from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
 from vislam.sensors.toml import SensorFile, SensorSetup, Suite, load_sensor_setup
 

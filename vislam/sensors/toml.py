@@ -19,7 +19,7 @@ from vislam.sensors.configured import Configured
 from vislam.sensors.correlated import Correlated
 from vislam.sensors.geodetic import Geodetic, why_nowhere
 from vislam.sensors.gnss.fixes import GnssSettings
-from vislam.sensors.registry import kind_class
+from vislam.sensors.kinds import kind_class
 from vislam.sensors.sensor import Sensor, Variable
 from vislam.sensors.simulated import Faults
 from vislam.sensors.ticks import TicksSettings
