@@ -11,7 +11,7 @@ from tiny import write_plan
 
 from dask_cluster import dask_cluster
 from vislam.core.errors import UsageError
-from vislam.experiment.engines import run_locally, run_on_dask
+from vislam.experiment.compare import run_locally, run_on_dask
 from vislam.experiment.isolated import run_isolated
 from vislam.experiment.jobs import expand
 from vislam.experiment.plan import load_plan

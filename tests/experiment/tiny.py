@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vislam.experiment import engines
+from vislam.experiment import compare
 from vislam.experiment.worker import run_job
 
 PLAN = """
@@ -53,5 +53,5 @@ def jobs_here():
             return result
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engines, "run_isolated", run_here)
+        patch.setattr(compare, "run_isolated", run_here)
         yield

@@ -1,21 +1,25 @@
 """A comparison from plan to report: what is missing runs, all is kept, tables and pictures are written."""
 
 import random
+import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from vislam.core.cluster import dask_client
 from vislam.core.errors import DataError, TrackingLostError, UsageError
 from vislam.core.files import write_json, write_text
 from vislam.core.progress import Progress, silent
 from vislam.core.reading import parse_toml, read_json
 from vislam.core.revision import code_revision
-from vislam.experiment import engines, winners
+from vislam.experiment import winners
 from vislam.experiment.identity import environment
+from vislam.experiment.isolated import run_isolated
 from vislam.experiment.jobs import Job, expand, source_identities, unique
 from vislam.experiment.options import CompareOptions
 from vislam.experiment.plan import Plan, load_plan, plan_text
@@ -32,6 +36,9 @@ Outcome = Literal["identical", "within the spread", "differs"]
 Rerun = Callable[[Sequence[Job]], dict[str, dict[str, Any]]]  # from jobs to results by key, without the store
 
 _FLOOR_M = 1e-6  # ensembles may agree to the last bit; a micrometre makes no difference
+Spec = dict[str, Any]
+Result = dict[str, Any]
+Finished = Generator[tuple[Spec, Result], None, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +143,7 @@ def _check(options: CompareOptions) -> None:
         raise UsageError("--sbatch is for --engine slurm")
 
 
-def _engine(jobs: Sequence[Job], options: CompareOptions) -> engines.Finished:
+def _engine(jobs: Sequence[Job], options: CompareOptions) -> Finished:
     specs = [job.spec() for job in jobs]
     cache, keep = options.cache.resolve(), None if options.keep_runs is None else options.keep_runs.resolve()
     if not specs:
@@ -144,9 +151,9 @@ def _engine(jobs: Sequence[Job], options: CompareOptions) -> engines.Finished:
     if options.engine == "slurm":
         yield from run_on_slurm(specs, options.sbatch, cache, keep, options.store.resolve().parent / "slurm")
     elif options.scheduler is not None:
-        yield from engines.run_on_dask(specs, options.scheduler, cache, keep)
+        yield from run_on_dask(specs, options.scheduler, cache, keep)
     else:
-        yield from engines.run_locally(specs, options.workers, cache, keep)
+        yield from run_locally(specs, options.workers, cache, keep)
 
 
 def _listing(jobs: Sequence[Job], store: ResultStore) -> Answer:
@@ -291,3 +298,49 @@ def _remarks(manifest: dict[str, Any]) -> list[str]:
         for name, value in mine.items()
         if theirs.get(name) != value
     ]
+
+
+def run_locally(specs: Sequence[Spec], workers: int, cache: Path, keep: Path | None) -> Finished:
+    """Yield each job with its result as it is done, in any order; closing the iterator stops what still runs.
+
+    The threads only wait: every job is a process of its own.
+    """
+    stop = threading.Event()
+    kept = None if keep is None else str(keep)
+    with ThreadPoolExecutor(workers, thread_name_prefix="job") as pool:
+        try:
+            futures = {pool.submit(run_isolated, spec, str(cache), kept, stop): spec for spec in specs}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def run_on_dask(specs: Sequence[Spec], scheduler: str, cache: Path, keep: Path | None) -> Finished:
+    """Yield each job with its result as a Dask worker finishes it; Dask gives the jobs of a lost worker to others.
+
+    Workers need this very version of vislam and the same paths to the recordings. A job that took several workers
+    down with it is a failed result. Raises UsageError without Dask or without a scheduler at that address.
+    """
+    with dask_client(scheduler, 0) as client:
+        from distributed import as_completed as finished_first
+
+        kept = None if keep is None else str(keep)
+        futures = {
+            client.submit(run_isolated, spec, str(cache), kept, key=f"vislam-{spec['key']}", pure=False): spec
+            for spec in specs
+        }
+        try:
+            for future in finished_first(list(futures), raise_errors=False):
+                yield futures[future], _outcome(future)
+        finally:
+            client.cancel(list(futures))
+
+
+def _outcome(future: Any) -> Result:
+    if future.status == "finished":
+        return dict(future.result())
+    if future.status == "cancelled":
+        return {"status": "stopped", "reason": "cancelled on the scheduler"}
+    return {"status": "failed", "reason": f"crash: {future.exception()!r}", "run": {}, "outputs": {}}
