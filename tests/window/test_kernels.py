@@ -7,7 +7,7 @@ import pytest
 
 from vislam.config import WindowConfig
 from vislam.core.messages import Array
-from vislam.window.equations import inertial, linear, schur, visual
+from vislam.window.equations import inertial, schur, solver, visual
 from vislam.window.equations.layout import (
     AXES,
     CALIBRATION,
@@ -178,18 +178,18 @@ def test_factorisation_solution_and_covariance_agree_with_numpy() -> None:
     half[:, ::3] *= half[:, ::3] > 0.5  # some zeros to skip
     A = half.T @ half + 0.1 * np.eye(30)
     U = A.copy()
-    assert linear.factorise(U)
+    assert solver.factorise(U)
     np.testing.assert_allclose(np.triu(U).T @ np.triu(U), A, atol=1e-10)
     b = rng.normal(size=30)
-    np.testing.assert_allclose(linear.solve(U, b), np.linalg.solve(A, b), rtol=1e-8)
+    np.testing.assert_allclose(solver.solve(U, b), np.linalg.solve(A, b), rtol=1e-8)
     inverse = np.linalg.inv(A)
-    np.testing.assert_allclose(linear.trailing_covariance(U, 12), inverse[12:, 12:], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(solver.trailing_covariance(U, 12), inverse[12:, 12:], rtol=1e-6, atol=1e-9)
     columns = np.array([3, 17])
     np.testing.assert_allclose(
-        linear.joint_covariance(U, columns), inverse[np.ix_(columns, columns)], rtol=1e-6, atol=1e-9
+        solver.joint_covariance(U, columns), inverse[np.ix_(columns, columns)], rtol=1e-6, atol=1e-9
     )
     A[4, 4] = -1.0
-    assert not linear.factorise(A)
+    assert not solver.factorise(A)
 
 
 def test_landmarks_are_found_at_their_depth() -> None:

@@ -8,7 +8,6 @@ a bad system is a value, not an exception. To be dropped when gtsam's smart fact
 """
 
 from vislam.window.equations.layout import AXES, CALIBRATION, STATE, Camera, Ints, Links, Normal, Prior, States, Views
-from vislam.window.equations.linear import joint_covariance, trailing_covariance
 from vislam.window.equations.marginal import Leaving, first_pose_prior, first_prior, marginalise, touched
 from vislam.window.equations.projection import (
     CALIBRATED,
@@ -35,7 +34,7 @@ from vislam.window.equations.projection import (
     through,
 )
 from vislam.window.equations.schur import invert
-from vislam.window.equations.solver import Problem, Room, Solution, optimise
+from vislam.window.equations.solver import Problem, Room, Solution, joint_covariance, optimise, trailing_covariance
 
 __all__ = [
     "AXES",

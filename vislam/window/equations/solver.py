@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from vislam.core.geometry import so3_exp, so3_log
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.window.equations import inertial, linear, schur, visual
+from vislam.window.equations import inertial, schur, visual
 from vislam.window.equations.layout import (
     CALIBRATION,
     RIGHT,
@@ -31,6 +32,7 @@ _MAX_TRIES = 8  # of damping, each ten times the last
 _FIRST_DAMPING = 1e-4  # relative to the diagonal
 _KNOWN = 1e18  # information on what is not estimated
 _MAX_RHO = 20.0  # 1/m: nothing is seen nearer than 5 cm
+_PIVOTS = (1e-12, 1e30)  # outside, information is rounding or nonsense
 
 
 class Solution(NamedTuple):
@@ -170,9 +172,9 @@ class _Equations:
             return False
         fixed = len(g) - CALIBRATION + np.flatnonzero(~p.camera.active)
         A[:, fixed], A[fixed], A[fixed, fixed], left[fixed] = 0.0, 0.0, _KNOWN, 0.0
-        if not linear.factorise(A):
+        if not factorise(A):
             return False
-        self._step, self.undamped = linear.solve(A, -left), damping == 0.0
+        self._step, self.undamped = solve(A, -left), damping == 0.0
         return True
 
     def moved(self, now: _Estimate) -> _Estimate | None:
@@ -244,3 +246,33 @@ def moved_states(X: Array, step: Array, where: Ints) -> Array:
             d[i] = step[where[k, i]]
         retract(out[k], d)
     return out
+
+
+# Matrices are upper triangles in rows: `A = U.T @ U`. Their transposes are lower triangles in columns, which is
+# LAPACK's own order, so nothing is copied.
+def factorise(A: Array) -> bool:
+    """Replace the upper triangle of A [D, D], contiguous, by its Cholesky factor; False where it has none."""
+    _, info = dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
+    pivots = np.diag(A) ** 2
+    return info == 0 and bool(((pivots > _PIVOTS[0]) & (pivots < _PIVOTS[1])).all())  # NaN is in no range
+
+
+def solve(U: Array, rhs: Array) -> Array:
+    """Return x with `U.T @ U @ x == rhs` for an upper factor [D, D] and a vector [D]."""
+    x, _ = dpotrs(U.T, rhs, lower=1)
+    return np.asarray(x, dtype=np.float64)
+
+
+def trailing_covariance(U: Array, start: int) -> Array:
+    """Return the covariance [D - start, D - start] of the unknowns that were eliminated last."""
+    half, _ = dpotri(U[start:, start:].T.copy(order="F"), lower=1, overwrite_c=1)
+    half = np.tril(half)
+    return np.asarray(half + np.tril(half, -1).T)
+
+
+def joint_covariance(U: Array, index: NDArray[np.int64]) -> Array:
+    """Return the covariance [N, N] of some of the unknowns, from the factor [D, D] of the information of all."""
+    columns = np.zeros((len(U), len(index)), order="F")
+    columns[index, np.arange(len(index))] = 1.0
+    half, _ = dtrtrs(U.T, columns, lower=1, overwrite_b=1)
+    return np.asarray(half.T @ half)
