@@ -9,7 +9,7 @@ import numpy as np
 from vislam.config import AttitudeConfig
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.imu.low_pass import low_pass
+from vislam.imu.levelling import low_pass
 
 _MAG_TAU_S = 9.0  # of the heading
 _MAG_FIELD_TAU_S = 0.05  # low-pass on the field's norm and dip

@@ -15,7 +15,6 @@ import numpy as np
 from vislam.core.geometry import so3_exp
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.imu.low_pass import low_pass
 
 _TAU_S = 3.0  # vqf: the force is averaged over it, at least
 _TAU_MAX_S = 10.0  # at most, while the body keeps its tilt
@@ -37,6 +36,21 @@ _REST_FORCE_M_S2 = 0.5  # and this
 _REST_TILT_M_S2 = 0.05
 _FORGOTTEN_RAD_S = np.deg2rad(0.1)  # the bias wanders by so much in `bias_forgetting_s`
 _UNSEEN = 2.5  # variance of white acceleration behind the filter, over tau^2 times that of its low-passed slope
+
+
+@njit(cache=True, nogil=True)
+def low_pass(state: Array, values: Array, dt_s: float, tau_s: float) -> None:
+    """Move a Butterworth filter on by one sample: state [2, N] is what it lets through and its slope per second.
+
+    `tau_s` is the time constant of its step response, the cutoff sqrt(2)/(2 pi tau_s). The differential equation is
+    solved exactly for a value held over the step, so steps may differ and `tau_s` may change between them.
+    """
+    decay = np.exp(-dt_s / tau_s)
+    c, s = decay * np.cos(dt_s / tau_s), decay * np.sin(dt_s / tau_s)
+    for i in range(len(values)):
+        off, drift = state[0, i] - values[i], tau_s * state[1, i]
+        state[0, i] = values[i] + c * off + s * (off + drift)
+        state[1, i] = (c * drift - s * (2.0 * off + drift)) / tau_s
 
 
 class Level(NamedTuple):
