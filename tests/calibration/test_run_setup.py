@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vislam.cli.verbs.live import LiveOptions
-from vislam.cli.verbs.web_page import begun_by_page
+from vislam.cli.verbs.live import LiveOptions, begun_by_page
 from vislam.cli.wizard.run_setup import RunSetup
 from vislam.config import CalibrationConfig, Config, SensorCalibration, SensorsConfig
 from vislam.core.camera import Camera

@@ -13,8 +13,7 @@ from vislam.cli.verbs import VERBS, terminal
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.brief import said_of
 from vislam.cli.verbs.completion import known_options, script
-from vislam.cli.verbs.live import ResumeOptions
-from vislam.cli.verbs.web_page import PageOptions, opened
+from vislam.cli.verbs.live import PageOptions, ResumeOptions, opened
 from vislam.config.ranges import settings_of
 from vislam.core.errors import UsageError
 
