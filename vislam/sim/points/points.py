@@ -25,8 +25,7 @@ from vislam.sim.faults.disturbance import in_window
 from vislam.sim.motion.measured import MeasuredMotion
 from vislam.sim.motion.motions import POINT_WORLDS, vi_sensor_rig, world_motion, world_rig
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.points.followed import Moves, SimulatedTracker, TrackNoise
-from vislam.sim.points.landmark_field import LandmarkField
+from vislam.sim.points.followed import LandmarkField, Moves, SimulatedTracker, TrackNoise
 from vislam.sim.sensing import CONSUMER_IMU, sense_imu
 from vislam.sim.worlds.simulation import TrueStates
 from vislam.sim.worlds.table import WORLDS, surrounded
