@@ -14,9 +14,8 @@ from vislam.core.messages import Array, LoopDecision
 from vislam.factors.keys import X
 from vislam.factors.loop import LoopModel, relative_covariance
 from vislam.graph.belief.anchors import Anchors
-from vislam.graph.belief.held import HeldLoops
+from vislam.graph.belief.held import HeldLoops, LoopReports
 from vislam.graph.belief.known import Known
-from vislam.graph.belief.reports import LoopReports
 from vislam.graph.estimator import Estimator
 from vislam.graph.travel import Travel
 

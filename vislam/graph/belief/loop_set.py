@@ -13,9 +13,8 @@ from vislam.factors.loop import LoopModel
 from vislam.graph.belief.anchors import Anchors
 from vislam.graph.belief.consensus import Consensus, Verdict
 from vislam.graph.belief.gate import Gate, PendingLoops
-from vislam.graph.belief.held import HeldLoops
+from vislam.graph.belief.held import HeldLoops, LoopReports
 from vislam.graph.belief.known import Known, worth_a_factor
-from vislam.graph.belief.reports import LoopReports
 from vislam.graph.estimator import Estimator
 from vislam.graph.segments import Segment, segments
 from vislam.graph.travel import Travel
