@@ -21,8 +21,7 @@ from vislam.core.readings import Motion, MotionReadings, OwnStart, PlacedReading
 from vislam.factors.builder import Label, Step
 from vislam.factors.journal import KeyframeRecord
 from vislam.factors.keys import X, nearest_rigid, own_key, walking_key
-from vislam.factors.reading_counts import ReadingCounts
-from vislam.factors.reading_factor import ReadingFactor, as_motion
+from vislam.factors.reading_factor import ReadingCounts, ReadingFactor, as_motion
 from vislam.factors.solvers import RELINEARIZE_OWN, RELINEARIZE_TRANSLATION_M
 from vislam.sensors import USER_ERRORS, Suite, Variable
 
