@@ -38,8 +38,7 @@ from vislam.core.readings import Reading  # noqa: E402
 from vislam.core.recording import Recording  # noqa: E402
 from vislam.sensors import BodyState, Configured, Suite, Variable, linearised  # noqa: E402
 from vislam.sensors.kinds import Height, Twist, TwistSettings  # noqa: E402
-from vislam.sensors.simulated import drawn_readings  # noqa: E402
-from vislam.sensors.true_path import bodies_on  # noqa: E402
+from vislam.sensors.simulated import bodies_on, drawn_readings  # noqa: E402
 
 CALLS, TIMES = 500, 7
 LEVER_M = (0.2, 0.1, -0.3)

@@ -26,8 +26,7 @@ from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
 from vislam.sensors import Suite
 from vislam.sensors.kinds import Wheels
-from vislam.sensors.simulated import drawn_readings
-from vislam.sensors.true_path import bodies_on
+from vislam.sensors.simulated import bodies_on, drawn_readings
 from vislam.trajectory import Trajectory, align, associate
 
 Radii = Literal["as told", "both 3 % larger", "left 3 % larger", "no wheels"]

@@ -15,9 +15,8 @@ from vislam.runs import execute, resume
 from vislam.runs.folder import prepare, read_setup
 from vislam.runs.further_sensors import drawn
 from vislam.runs.sources import open_source
-from vislam.sensors.simulated import drawn_readings
+from vislam.sensors.simulated import bodies_on, drawn_readings
 from vislam.sensors.toml import SensorSetup, load_sensor_setup
-from vislam.sensors.true_path import bodies_on
 from vislam.trajectory import read_tum
 from worlds.mini_recording import imu_rows, write_camera, write_imu
 from worlds.sensed_drive import FIXES, SOURCE, WHEELS, Driven, drive, driven, settings

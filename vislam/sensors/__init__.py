@@ -12,8 +12,7 @@ from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
 from vislam.sensors.toml import SensorFile, SensorSetup, Suite, load_sensor_setup
 
 if TYPE_CHECKING:
-    from vislam.sensors.simulated import Faults, drawn_readings
-    from vislam.sensors.true_path import bodies_on
+    from vislam.sensors.simulated import Faults, bodies_on, drawn_readings
 
 __all__ = [
     "USER_ERRORS",
@@ -43,7 +42,7 @@ __getattr__ = late(
     __name__,
     {
         "Faults": "vislam.sensors.simulated",
-        "bodies_on": "vislam.sensors.true_path",
+        "bodies_on": "vislam.sensors.simulated",
         "drawn_readings": "vislam.sensors.simulated",
     },
 )
