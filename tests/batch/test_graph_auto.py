@@ -13,7 +13,7 @@ from vislam.batch.posegraph import optimize
 from vislam.batch.posegraph.files import read_pose_graph
 from vislam.batch.posegraph.noise import covariances_of_edges, noise_of_kinds, rescaled
 from vislam.batch.posegraph.optimize import optimize_pose_graph
-from vislam.batch.posegraph.robust import kernel_weights
+from vislam.batch.posegraph.solver import kernel_weights
 from vislam.batch.posegraph.structure import Structure
 from vislam.batch.posegraph.worlds import simulate_graph
 from vislam.config import GraphWorldConfig, PoseGraphConfig

@@ -23,8 +23,7 @@ from vislam.batch.posegraph.gnc import reject_false_edges, trusted_edges
 from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
 from vislam.batch.posegraph.plain import solve
 from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
-from vislam.batch.posegraph.robust import Kernel, kernel_route
-from vislam.batch.posegraph.solver import Progress, levenberg_marquardt
+from vislam.batch.posegraph.solver import Kernel, Progress, kernel_route, levenberg_marquardt
 from vislam.batch.posegraph.starts import chordal_start, odometry_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig

@@ -13,8 +13,7 @@ import numpy as np
 from vislam.batch.posegraph.gnc import TAILS, graduated_non_convexity
 from vislam.batch.posegraph.growing import grown_start
 from vislam.batch.posegraph.problem import Decision, Ids, Mask, PoseGraphProblem
-from vislam.batch.posegraph.robust import KERNEL_CHI2, kernel_weights
-from vislam.batch.posegraph.solver import Progress
+from vislam.batch.posegraph.solver import KERNEL_CHI2, Progress, kernel_weights
 from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
