@@ -20,7 +20,6 @@ from vislam.core.memory import Learned
 from vislam.core.messages import Array, Bools, Frame, ImuSpan, Keyframe, Observations
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframes import PATIENCE_S, Exposed, KeyframeLife, keyframe_reason
-from vislam.frontend.planar.course import Course
 from vislam.frontend.planar.fit import Fit, FloorPair, camera_motion, joint_fit, no_fit, split_fit
 from vislam.frontend.planar.floor import Mount, Regions, Tilt, make_mount
 from vislam.frontend.planar.floor_tracks import FloorTracks, Steps
@@ -28,6 +27,7 @@ from vislam.frontend.planar.place import (
     MIN_CELLS,
     MIN_POINTS,
     STAMP_JITTER_S,
+    Course,
     Place,
     by_jitter,
     by_tilt,
