@@ -23,9 +23,8 @@ from vislam.core.geometry import invert
 from vislam.core.messages import Frame, ImuSample, MagSample, Submaps
 from vislam.core.recording import Recording, WrappedRecording
 from vislam.pipeline.dark import dark
-from vislam.sim.motion.path import Travel, rounded_path
+from vislam.sim.motion.path import Travel, rounded_path, walk
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.motion.walk import walk
 from vislam.sim.scene import Painter, SceneBuilder, paint, shell, signs
 from vislam.sim.worlds.simulation import open_world
 from vislam.sim.worlds.table import World

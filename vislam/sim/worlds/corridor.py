@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from vislam.sim.motion.path import Travel, rounded_path
+from vislam.sim.motion.path import Travel, rounded_path, walk
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.motion.walk import walk
 from vislam.sim.scene import SceneBuilder, furniture, paint, shell, signs
 
 _X, _Y, _Z = 10.5, 6.5, 2.6  # half sizes of the centre line, height

@@ -12,9 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from vislam.core.messages import ImageU8
-from vislam.sim.motion.path import Travel, rounded_path
+from vislam.sim.motion.path import Travel, rounded_path, walk
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.motion.walk import walk
 from vislam.sim.scene import Painter, SceneBuilder, furniture, paint, shell, signs
 
 _CENTRE_M = 5.6  # of the halls and of the corridors, from the middle of the block along x and y
