@@ -10,11 +10,10 @@ from scipy.spatial.transform import Rotation
 from vislam.calibration.self_calibration import waving
 from vislam.calibration.self_calibration.adjust import Shared, steadied
 from vislam.calibration.self_calibration.certainty import certainty
-from vislam.calibration.self_calibration.gyro import Gyro
 from vislam.calibration.self_calibration.lens_search import Solution, find_lens, with_gyro
 from vislam.calibration.self_calibration.patches import _aligned
 from vislam.calibration.self_calibration.segments import Segment
-from vislam.calibration.self_calibration.structure import GYRO, READOUT, SHARED, Structure, linearise, residuals
+from vislam.calibration.self_calibration.structure import GYRO, READOUT, SHARED, Gyro, Structure, linearise, residuals
 from vislam.core.camera import Camera, Rig
 from vislam.core.messages import Array
 from vislam.datasets.camera_files import read_cameras

@@ -13,17 +13,22 @@ from functools import cached_property
 import numpy as np
 
 from vislam.calibration.cameras import parameters_of
-from vislam.calibration.self_calibration.gyro import BIAS, OFFSET, SCALE, Gyro, TurnRows, turn_rows
 from vislam.calibration.self_calibration.segments import Segment
 from vislam.calibration.self_calibration.structure import (
+    BIAS,
     GYRO,
     LENS,
+    OFFSET,
     READOUT,
+    SCALE,
     SHARED,
+    Gyro,
     Linear,
     Structure,
+    TurnRows,
     linearise,
     residuals,
+    turn_rows,
 )
 from vislam.core.camera import Camera
 from vislam.core.errors import DataError

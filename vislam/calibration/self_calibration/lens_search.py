@@ -8,9 +8,8 @@ import numpy as np
 
 from vislam.calibration.extrinsics import RotationPair, solve_hand_eye
 from vislam.calibration.self_calibration.adjust import Piece, Prior, Shared, adjust, judged, scatter_px, steadied
-from vislam.calibration.self_calibration.gyro import SCALE, Gyro
 from vislam.calibration.self_calibration.segments import LEAST_KEYFRAMES, Segment
-from vislam.calibration.self_calibration.structure import GYRO, LENS, READOUT, SHARED, Structure
+from vislam.calibration.self_calibration.structure import GYRO, LENS, READOUT, SCALE, SHARED, Gyro, Structure
 from vislam.core.camera import Camera
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, Bools

@@ -13,12 +13,11 @@ from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.calibration.self_calibration.adjust import Piece, Shared
 from vislam.calibration.self_calibration.certainty import Certainty, certainty
 from vislam.calibration.self_calibration.depth_lens import focal_by_depth, with_focal
-from vislam.calibration.self_calibration.gyro import BIAS, OFFSET, SCALE, Gyro
 from vislam.calibration.self_calibration.lens_search import Solution, find_lens, with_gyro
 from vislam.calibration.self_calibration.lever_arm import LeverArm, find_lever_arm
 from vislam.calibration.self_calibration.patches import found_again
 from vislam.calibration.self_calibration.segments import Segment, follow_segments
-from vislam.calibration.self_calibration.structure import GYRO, READOUT
+from vislam.calibration.self_calibration.structure import BIAS, GYRO, OFFSET, READOUT, SCALE, Gyro
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert, so3_log, transform
