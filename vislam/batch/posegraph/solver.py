@@ -79,7 +79,10 @@ def levenberg_marquardt(
 
 
 def kernel_weights(kernel: Kernel, chi2: Array, scale: float) -> Array:
-    """Return the weights [M] of loops by their chi2 [M]."""
+    """Return the weights [M] of loops by their chi2 [M].
+
+    Dynamic covariance scaling ("dcs"): Agarwal, Tipaldi, Spinello, Stachniss, Burgard, ICRA 2013.
+    """
     if kernel == "cauchy":
         return scale / (scale + chi2)
     if kernel == "geman-mcclure":
@@ -97,6 +100,10 @@ def kernel_route(
     progress: Progress | None = None,
 ) -> tuple[Array, Array] | None:
     """Return poses [N, d + 1, d + 1] under the kernel and the weights [E] of the edges; those trusted [E] have 1.
+
+    The scale goes from what odometry errs by to its last value, as graduated non-convexity does (Yang, Antonante,
+    Tzoumas, Carlone, RA-L 2020). Loops that weigh next to nothing are left out of the equations: false ones join
+    far-off poses and would fill the factor.
 
     With `give_up`, None where too many loops count for their factor to be cheap: few that agree do not fill it.
     `poses` is where to start; `first_scale` is the chi2 of loops that still count there, KERNEL_CHI2 at least.

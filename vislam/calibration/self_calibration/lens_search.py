@@ -186,7 +186,7 @@ def _only(*places: int) -> Bools:
 
 
 def start_structure(segment: Segment, camera: Camera) -> tuple[Segment, Structure, Bools] | None:
-    """Return poses and points as a lens sees them; None where the views do not fit together.
+    """Return poses and points as a lens roughly sees them, from two views and then one after the other; None: no fit.
 
     Returns:
         The stretch with those of its keyframes that found a place, the structure, and which points [m] are placed.

@@ -23,7 +23,7 @@ _UNEXPLAINED_RATIO = 0.3  # of the points that should be on the floor; fewer agr
 
 
 class Course:
-    """Predicts by the velocity seen last and by the gyroscope's yaw.
+    """Predicts by the velocity seen last and by the gyroscope's yaw. Motions [3] are theta, x, y of the level frame.
 
     Attributes:
         motion: [3] since the keyframe, of the newest frame; predicted while lost.

@@ -350,7 +350,11 @@ def tilt_error_rad(T_from_to: Array, T_map_from: Array, T_map_to: Array) -> floa
 
 
 def judge(found: Verification, tilt_rad: float | None) -> tuple[LoopDecision, str]:
-    """Return whether a candidate is offered to the graph, by its verification and its tilt (None: unknown), and why."""
+    """Return whether a candidate is offered to the graph, by its verification and its tilt (None: unknown), and why.
+
+    Enough inliers alone do not do: what remains wrong after PnP is the right place with a bad pose, or an object that
+    exists twice. The first shows in its own measurement; which of two places it is, only the graph can tell.
+    """
     if found.T_a_b is None:
         return LoopDecision.REJECTED, found.reason
     seen = found.reason or f"{found.inliers} inliers, {found.supporters} with guided matching"
