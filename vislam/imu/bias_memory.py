@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +24,10 @@ _TEMPERATURE_RANGE_C = (-60.0, 150.0)
 class BiasMemory:
     """One bias [3] per degree of temperature, the newest; at most `limit` of them, the nearest to the last added."""
 
-    def __init__(self, limit: int, entries: Mapping[int, tuple[float, Array]] | None = None) -> None:
-        """Start with what is known: rounded temperature -> (temperature, bias)."""
+    def __init__(self, limit: int) -> None:
+        """Start empty."""
         self._limit = limit
-        self._entries = dict(entries or {})
+        self._entries: dict[int, tuple[float, Array]] = {}  # rounded temperature -> (temperature, bias)
 
     def __len__(self) -> int:
         """Return how many biases are kept."""

@@ -13,6 +13,7 @@ from vislam.imu import ImuNoise
 from vislam.sim.motion.spline import Motion
 
 GAMMA = 2.2  # between linear light and the display values of images
+_ELECTRONS, _READ_ELECTRONS = 6000.0, 10.0  # full well, whose shot noise is its root; deviation of the read noise
 
 CONSUMER_IMU = ImuNoise(
     gyroscope_noise_density=4.0e-4,  # about 0.02 deg/s/sqrt(Hz), between a phone's and a GY-85's gyro
@@ -104,17 +105,13 @@ def _expose(color: ImageF32, response: ImageF32, sigma: ImageF32, white: ImageF3
 class Imager:
     """Turns rendered images into what an 8-bit camera delivers: gain, vignetting, shot and read noise, clipping."""
 
-    def __init__(
-        self, width: int, height: int, noisy: bool, electrons: float = 6000.0, read_electrons: float = 10.0
-    ) -> None:
+    def __init__(self, width: int, height: int, noisy: bool) -> None:
         """Prepare the tables.
 
         Args:
             width: image width in pixels.
             height: image height in pixels.
             noisy: False leaves out noise and vignetting.
-            electrons: full well; shot noise is the square root of the electrons counted.
-            read_electrons: deviation of the read noise.
         """
         y, x = np.mgrid[0:height, 0:width].astype(np.float64)
         squared = ((x - 0.5 * (width - 1)) ** 2 + (y - 0.5 * (height - 1)) ** 2) / (0.25 * (width**2 + height**2))
@@ -122,7 +119,7 @@ class Imager:
         self._vignette = ((1.0 - falloff * squared) ** (1.0 / GAMMA)).astype(np.float32)
         light = np.maximum((np.arange(256) + 0.5) / 255.0, 0.02) ** GAMMA
         slope = 255.0 / GAMMA * light ** (1.0 / GAMMA - 1.0)  # of the display value by light
-        deviation = np.sqrt(light * electrons + read_electrons**2) / electrons * slope
+        deviation = np.sqrt(light * _ELECTRONS + _READ_ELECTRONS**2) / _ELECTRONS * slope
         self._sigma = (deviation if noisy else np.zeros(256)).astype(np.float32)
         self._noisy = noisy
 

@@ -23,6 +23,7 @@ Descriptors = NDArray[np.uint8]
 Words = NDArray[np.uint64]
 
 _BORDER_PX = 12  # corners nearer to the border lose half of their window as soon as the camera moves
+_ORB_FAST_THRESHOLD, _ORB_CELL_PX = 10, 40
 _ORB_BORDER_PX = 31  # ORB's patch; OpenCV drops keypoints nearer to the border
 _AT_ONCE_PX = 8  # columns of a window that OpenCV's Lucas-Kanade takes at once; the rest costs as much one by one
 LEAST_USED = 128  # in a mask: a pixel of less is not used
@@ -75,7 +76,7 @@ def detect_corners(
     rows, columns = np.nonzero(peaks)
     strengths = response[rows, columns]
     candidates = np.column_stack([columns, rows]).astype(np.float64)
-    rank = _rank_in_cells(candidates, strengths, cell_px, image.shape[1])
+    rank = _rank_in_cells(candidates, strengths, _ORB_CELL_PX, image.shape[1])
     order = np.lexsort((-strengths, rank))
     usable = live[np.isfinite(live).all(axis=1)]
     chosen = _choose_apart(candidates[order], usable, count, min_distance_px, image.shape[1], image.shape[0])
@@ -236,9 +237,7 @@ def _flow(
     return there[:, 0], status[:, 0] == 1, error[:, 0]
 
 
-def describe(
-    image: ImageU8, count: int = 1000, cell_px: int = 40, fast_threshold: int = 10, mask: ImageU8 | None = None
-) -> tuple[Array, Descriptors]:
+def describe(image: ImageU8, count: int = 1000, mask: ImageU8 | None = None) -> tuple[Array, Descriptors]:
     """Find and describe ORB keypoints spread over a grey image [H, W], or what its mask [H, W] lets be used of it.
 
     Three times too many are detected over eight octaves and served cell by cell, so that one rich corner of the image
@@ -247,13 +246,13 @@ def describe(
     Returns:
         Pixels [N, 2] and descriptors [N, 32], N <= count; both empty for an image without features.
     """
-    orb = cv2.ORB.create(3 * count, fastThreshold=fast_threshold, edgeThreshold=_ORB_BORDER_PX)
+    orb = cv2.ORB.create(3 * count, fastThreshold=_ORB_FAST_THRESHOLD, edgeThreshold=_ORB_BORDER_PX)
     keypoints = orb.detect(image, None if mask is None else np.where(mask >= LEAST_USED, mask, np.uint8(0)))
     if not keypoints:
         return np.empty((0, 2)), np.empty((0, 32), dtype=np.uint8)
     pixels = _places(keypoints)
     strengths = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
-    rank = _rank_in_cells(pixels, strengths, cell_px, image.shape[1])
+    rank = _rank_in_cells(pixels, strengths, _ORB_CELL_PX, image.shape[1])
     chosen: Sequence[int] = np.lexsort((-strengths, rank))[:count].tolist()
     kept, descriptors = orb.compute(image, [keypoints[i] for i in chosen])
     if descriptors is None:
