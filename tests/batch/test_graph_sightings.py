@@ -8,8 +8,8 @@ import pytest
 
 from vislam.batch.posegraph.files import read_pose_graph, write_pose_graph
 from vislam.batch.posegraph.g2o import read_g2o
-from vislam.batch.posegraph.growing import grown_start
 from vislam.batch.posegraph.optimize import optimize_pose_graph
+from vislam.batch.posegraph.plain import grown_start
 from vislam.batch.posegraph.sightings import undetermined_landmarks
 from vislam.batch.posegraph.uncertainty import Uncertainty
 from vislam.cli import run_verb

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from vislam.batch.posegraph.arithmetic import errors_2d, errors_3d
 from vislam.batch.posegraph.clusters import Clusters, RigidMotions, grown
-from vislam.batch.posegraph.growing import part_of
 from vislam.batch.posegraph.ordering import adjacency
-from vislam.batch.posegraph.plain import solve
+from vislam.batch.posegraph.plain import part_of, solve
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
 from vislam.batch.posegraph.solver import Descent, Progress, levenberg_marquardt
 from vislam.batch.posegraph.structure import NormalEquations, Structure, adjoints

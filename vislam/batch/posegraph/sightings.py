@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from vislam.batch.posegraph.gnc import TAILS, graduated_non_convexity
-from vislam.batch.posegraph.growing import grown_start
+from vislam.batch.posegraph.plain import grown_start
 from vislam.batch.posegraph.problem import Decision, Ids, Mask, PoseGraphProblem
 from vislam.batch.posegraph.solver import KERNEL_CHI2, Progress, kernel_weights
 from vislam.batch.posegraph.structure import Structure
