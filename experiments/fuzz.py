@@ -687,7 +687,7 @@ def _read_calibrations(folder: Path) -> None:
     from vislam.datasets.calibration import read_camera
     from vislam.datasets.camera_files import read_cameras
     from vislam.datasets.imu_files import read_imu_calibration, read_mag_calibration, read_noise
-    from vislam.imu.bias_memory import BiasMemory
+    from vislam.imu.power_up import BiasMemory
 
     readers: tuple[Callable[[Path], object], ...] = (
         read_cameras, read_camera, read_noise, read_imu_calibration, read_mag_calibration,

@@ -12,8 +12,7 @@ from vislam.config import PowerUpConfig
 from vislam.core.errors import DataError, StorageError
 from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array, ImuSpan
-from vislam.imu.bias_memory import BiasMemory
-from vislam.imu.power_up import PowerUp, Refusal, power_up
+from vislam.imu.power_up import BiasMemory, PowerUp, Refusal, power_up
 
 GRAVITY_M_S2 = 9.81
 CONFIG = PowerUpConfig()

@@ -7,11 +7,10 @@ load gtsam; `vqf` is to be preferred if it takes a changing interval and is as g
 
 from vislam.core.imu_noise import ImuCalibration, ImuNoise, MagCalibration
 from vislam.imu.attitude import AttitudeFilter
-from vislam.imu.bias_memory import BiasMemory
 from vislam.imu.buffer import ImuBuffer
 from vislam.imu.condition import ConditionWatch, InertialCondition
 from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
-from vislam.imu.power_up import PowerUp, Refusal, power_up
+from vislam.imu.power_up import BiasMemory, PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, pose_after, preintegrate
 from vislam.imu.rest import RestDetector, is_slow
 from vislam.imu.resting import state_at_rest
