@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vislam.calibration.inertial.allan import allan_curve, fit_noise
+from vislam.calibration.inertial.noise import allan_curve, fit_noise
 from vislam.datasets.imu_files import read_noise
 from worlds.calibration import calibrate, refusal, still_imu, write_table
 
