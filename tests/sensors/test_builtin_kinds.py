@@ -10,7 +10,6 @@ from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors import BodyState, Suite, linearised
-from vislam.sensors.configured import Configured
 from vislam.sensors.kinds import (
     Ackermann,
     AckermannSettings,
@@ -35,6 +34,7 @@ from vislam.sensors.kinds import (
 )
 from vislam.sensors.linear import derived
 from vislam.sensors.measuring_frame import about_up
+from vislam.sensors.sensor import Configured
 from vislam.sensors.simulated import Faults, drawn_readings
 
 ANCHORS = {"1": (4.0, 1.0, 2.0), "2": (-3.0, 5.0, 2.5), "0x10": (0.5, -6.0, 0.2)}

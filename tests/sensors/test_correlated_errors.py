@@ -13,8 +13,8 @@ from vislam.core.messages import Array
 from vislam.core.readings import OwnStart, PlacedReading, Reading
 from vislam.graph import PoseGraph
 from vislam.sensors import BodyState, Correlated, Sensor, Suite, Variable, drawn_readings, wrong_jacobians
-from vislam.sensors.configured import Configured
 from vislam.sensors.kinds import AnchorRange, AnchorRangeSettings, Height, Pose, Position, PositionSettings, Wheels
+from vislam.sensors.sensor import Configured
 from vislam.sensors.toml import load_sensor_setup
 from worlds import monte_carlo as mc
 from worlds.lap import RIG, World

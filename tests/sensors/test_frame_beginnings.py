@@ -11,7 +11,6 @@ from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors import Begun, BodyState
-from vislam.sensors.configured import Configured
 from vislam.sensors.kinds import (
     AnchorRange,
     AnchorRangeSettings,
@@ -24,6 +23,7 @@ from vislam.sensors.kinds import (
     PositionSettings,
 )
 from vislam.sensors.measuring_frame import ENOUGH_YAW_RAD
+from vislam.sensors.sensor import Configured
 from vislam.sensors.simulated import Faults, drawn_readings
 
 SEEDS = range(20)

@@ -9,7 +9,6 @@ from vislam.core.geometry import so3_exp
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors import BodyState, linearised
-from vislam.sensors.configured import Configured
 from vislam.sensors.kinds import (
     Ackermann,
     AckermannSettings,
@@ -27,6 +26,7 @@ from vislam.sensors.kinds import (
     Wheels,
     WheelsSettings,
 )
+from vislam.sensors.sensor import Configured
 from vislam.sensors.simulated import drawn_readings
 
 ANCHORS = {"1": (0.0, 0.0, 2.5), "2": (30.0, 0.0, 6.0), "3": (30.0, 30.0, 0.5), "4": (0.0, 30.0, 4.0)}

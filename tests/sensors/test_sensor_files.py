@@ -17,11 +17,11 @@ from vislam.core import Problems
 from vislam.core.errors import DataError, VislamError
 from vislam.core.readings import Reading
 from vislam.datasets.sensor_files import local_frame, sensor_readings
-from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.gnss import GnssSettings, NmeaFixes, UbxFixes
 from vislam.sensors.gnss.ubx import _checksum
 from vislam.sensors.kinds import AnchorRange, AnchorRangeSettings, Height, Pose, Position, Wheels
+from vislam.sensors.sensor import Configured
 from vislam.sensors.ticks import TickSpeeds, TicksSettings, counted
 from vislam.sensors.toml import FileFormat, SensorFile
 

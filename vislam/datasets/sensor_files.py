@@ -16,9 +16,9 @@ from vislam.core.readings import Reading
 from vislam.core.recording import Problems
 from vislam.datasets.tables import Row, header, in_time_order, parse_ns, parse_seconds, read_rows
 from vislam.datasets.telemetry import open_joined
-from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic, LocalFrame
 from vislam.sensors.gnss import Fix, FixReadings, NmeaFixes, UbxFixes
+from vislam.sensors.sensor import Configured
 from vislam.sensors.ticks import TickSpeeds
 from vislam.sensors.toml import SensorFile
 

@@ -4,11 +4,10 @@ from typing import TYPE_CHECKING
 
 from vislam.core.late import late
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured
 from vislam.sensors.correlated import Correlated
 from vislam.sensors.kinds import kind_class, register
 from vislam.sensors.linear import Linear, SensorError, derived, linearised, wrong_jacobians
-from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
+from vislam.sensors.sensor import USER_ERRORS, Begun, Configured, Sensor, Variable
 from vislam.sensors.toml import SensorFile, SensorSetup, Suite, load_sensor_setup
 
 if TYPE_CHECKING:

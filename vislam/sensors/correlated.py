@@ -9,10 +9,9 @@ from vislam.core.errors import UsageError
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.body import NUDGE, BodyState
-from vislam.sensors.configured import Configured
 from vislam.sensors.linear import derived, linearised
 from vislam.sensors.measuring_frame import is_heading_known, thinned_pairs
-from vislam.sensors.sensor import USER_ERRORS, Begun, Sensor, Variable
+from vislam.sensors.sensor import USER_ERRORS, Begun, Configured, Sensor, Variable
 
 _AS_THE_SENSOR = (
     "columns", "sigma_columns", "touches", "sees_motion_only", "gives_fixes", "slips", "sources", "gate_probability",

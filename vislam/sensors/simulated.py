@@ -14,7 +14,7 @@ from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.core.trajectory import Trajectory
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured
+from vislam.sensors.sensor import Configured
 
 Spans = tuple[tuple[float, float], ...]  # from and to, in seconds after the first body
 _KNOT_NS = 50_000_000  # finer, the noise of a measured truth would be taken for motion

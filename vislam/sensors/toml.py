@@ -15,12 +15,11 @@ from vislam.core.errors import UsageError
 from vislam.core.messages import Array
 from vislam.core.reading import read_toml
 from vislam.core.readings import Reading
-from vislam.sensors.configured import Configured
 from vislam.sensors.correlated import Correlated
 from vislam.sensors.geodetic import Geodetic, why_nowhere
 from vislam.sensors.gnss.fixes import GnssSettings
 from vislam.sensors.kinds import kind_class
-from vislam.sensors.sensor import Sensor, Variable
+from vislam.sensors.sensor import Configured, Sensor, Variable
 from vislam.sensors.simulated import Faults
 from vislam.sensors.ticks import TicksSettings
 

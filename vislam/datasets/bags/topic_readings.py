@@ -31,10 +31,10 @@ from vislam.datasets.bags.decoding import (
 )
 from vislam.datasets.bags.listing import Entry, Listing, fitting, stamp
 from vislam.datasets.bags.streams import messages_of
-from vislam.sensors.configured import Configured
 from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.gnss import Fix, FixReadings
 from vislam.sensors.gnss.fixes import FixKind
+from vislam.sensors.sensor import Configured
 from vislam.sensors.toml import JointsSettings, SensorFile
 
 _FIXES: dict[int, FixKind] = {0: "single", 1: "differential", 2: "float"}  # 2: anything that a station on earth helps

@@ -4,7 +4,6 @@ import re
 
 from vislam.core.errors import UsageError
 from vislam.core.kinds import Kinds
-from vislam.sensors.configured import Configured
 from vislam.sensors.kinds.ackermann import Ackermann, AckermannSettings
 from vislam.sensors.kinds.anchor_range import AnchorRange, AnchorRangeSettings
 from vislam.sensors.kinds.given_pose import Odometry, OdometrySettings, Pose, PoseSettings
@@ -14,6 +13,7 @@ from vislam.sensors.kinds.magnetic_field import MagneticField, MagneticFieldSett
 from vislam.sensors.kinds.position import Position, PositionSettings
 from vislam.sensors.kinds.twist import Omni, Twist, TwistSettings
 from vislam.sensors.kinds.wheels import Wheels, WheelsSettings
+from vislam.sensors.sensor import Configured
 
 __all__ = [
     "Ackermann", "AckermannSettings", "AnchorRange", "AnchorRangeSettings", "Heading", "HeadingSettings", "Height",

@@ -13,7 +13,6 @@ from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.alignment import with_shared_errors
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import (
     ANYWHERE_M,
     FrameKind,
@@ -24,7 +23,7 @@ from vislam.sensors.measuring_frame import (
     vector_variables,
 )
 from vislam.sensors.ranging import Prior, Ranges, ranged_frame
-from vislam.sensors.sensor import Begun, Variable
+from vislam.sensors.sensor import Begun, Configured, Variable, noisy
 
 _MOST_ANCHORS = 256
 _TOUCHING_M = 1e-6  # an antenna at its anchor has no direction to it

@@ -8,9 +8,8 @@ import numpy as np
 from vislam.config.sensors import Vector3
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured
 from vislam.sensors.mounting import Mount
-from vislam.sensors.sensor import Variable
+from vislam.sensors.sensor import Configured, Variable
 
 
 class Compared(NamedTuple):

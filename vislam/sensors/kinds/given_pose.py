@@ -22,7 +22,6 @@ from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.alignment import with_starts
 from vislam.sensors.body import PARTS, BodyState
-from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import (
     UP,
     FrameKind,
@@ -32,7 +31,7 @@ from vislam.sensors.measuring_frame import (
     placed,
     thinned_pairs,
 )
-from vislam.sensors.sensor import Begun, Variable
+from vislam.sensors.sensor import Begun, Configured, Variable, noisy
 
 Quaternion = tuple[Finite, Finite, Finite, Finite]
 _UNIT = 0.01  # by which a quaternion's norm may be off: four decimals

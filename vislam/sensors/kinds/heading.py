@@ -9,8 +9,7 @@ from vislam.config.ranges import Finite, NonNegative, Positive
 from vislam.core.angles import wrapped
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured, noisy
-from vislam.sensors.sensor import Variable
+from vislam.sensors.sensor import Configured, Variable, noisy
 
 _UPRIGHT = 0.1  # cosine of the x axis's slope (84 deg) below which the body has no heading
 

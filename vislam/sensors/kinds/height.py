@@ -9,9 +9,8 @@ from vislam.config.sensors import Vector3
 from vislam.core.geometry import skew
 from vislam.core.messages import Array
 from vislam.sensors.body import PARTS, BodyState
-from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import ANYWHERE_M
-from vislam.sensors.sensor import Variable
+from vislam.sensors.sensor import Configured, Variable, noisy
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,7 @@ from vislam.core.geometry import skew
 from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured, noisy
-from vislam.sensors.sensor import Begun, Variable
+from vislam.sensors.sensor import Begun, Configured, Variable, noisy
 
 _MOST_UT = 1000.0  # the earth's field has 25 to 65; a motor's magnet close by has a thousand
 _LEAST_UT = 2.0

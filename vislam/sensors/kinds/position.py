@@ -11,7 +11,6 @@ from vislam.core.messages import Array
 from vislam.core.readings import Reading
 from vislam.sensors.alignment import aligned_frame, with_shared_errors, with_starts
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import Configured, noisy
 from vislam.sensors.measuring_frame import (
     FrameKind,
     frame_variables,
@@ -20,7 +19,7 @@ from vislam.sensors.measuring_frame import (
     thinned_pairs,
     vector_variables,
 )
-from vislam.sensors.sensor import Begun
+from vislam.sensors.sensor import Begun, Configured, noisy
 
 
 @dataclass(frozen=True, slots=True)

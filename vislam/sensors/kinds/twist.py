@@ -9,10 +9,9 @@ from vislam.config.ranges import NonNegative, Positive
 from vislam.config.sensors import Vector3
 from vislam.core.messages import Array
 from vislam.sensors.body import BodyState
-from vislam.sensors.configured import noisy
 from vislam.sensors.kinds.driven import NO_TURN, Compared, Driven
 from vislam.sensors.mounting import Mount
-from vislam.sensors.sensor import Variable
+from vislam.sensors.sensor import Variable, noisy
 
 
 @dataclass(frozen=True, slots=True)
