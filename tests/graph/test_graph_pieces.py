@@ -16,7 +16,7 @@ from vislam.core.geometry import invert, so3_exp, transform
 from vislam.core.memory import Tied
 from vislam.core.messages import Array, GraphUpdate, LoopDecision, LoopEdge, Submaps
 from vislam.graph import PoseGraph
-from vislam.graph.belief.anchors import Anchors
+from vislam.graph.belief.gate import Anchors
 from vislam.graph.travel import Travel
 from worlds.lap import RIG, World, rmse_m
 from worlds.parts import MACHINE

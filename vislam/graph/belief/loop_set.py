@@ -10,9 +10,8 @@ from vislam.core.memory import EdgeReport, LoopPlace, LoopState, OfferedLoop, Ti
 from vislam.core.messages import Array, LoopDecision, LoopEdge
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
-from vislam.graph.belief.anchors import Anchors
 from vislam.graph.belief.consensus import Consensus, Verdict
-from vislam.graph.belief.gate import Gate, PendingLoops
+from vislam.graph.belief.gate import Anchors, Gate, PendingLoops
 from vislam.graph.belief.held import HeldLoops, LoopReports
 from vislam.graph.belief.known import Known, worth_a_factor
 from vislam.graph.estimator import Estimator
