@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vislam.calibration.extrinsics.hand_eye import HandEye, solve_hand_eye
-from vislam.calibration.extrinsics.visual_rotation import RotationPair
+from vislam.calibration.extrinsics.hand_eye import HandEye, RotationPair, solve_hand_eye
 from vislam.datasets import open_dataset
 from vislam.datasets.camera_files import read_cameras
 from worlds.calibration import calibrate, refusal

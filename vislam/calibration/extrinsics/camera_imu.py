@@ -7,8 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vislam.calibration.extrinsics.hand_eye import HandEye, solve_hand_eye
-from vislam.calibration.extrinsics.visual_rotation import RotationPair, metric_rotations, visual_rotations
+from vislam.calibration.extrinsics.hand_eye import (
+    HandEye,
+    RotationPair,
+    metric_rotations,
+    solve_hand_eye,
+    visual_rotations,
+)
 from vislam.calibration.options import CameraImuOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
 from vislam.config import FrontEndConfig
