@@ -12,14 +12,13 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement, no_observations
 from vislam.frontend.attempt import DEGRADED_INLIERS, Attempt, weakness
-from vislam.frontend.blind_keyframe import NO_DEPTH, BlindKeyframe
 from vislam.frontend.by_depth import ByDepth, Moved
 from vislam.frontend.intake import Intake
 from vislam.frontend.keyframe_tracks import KeyframeTracks
 from vislam.frontend.keyframes import KeyframeLife, keyframe_reason
 from vislam.frontend.local_surfaces import LocalSurfaces
 from vislam.frontend.pixel_noise import PixelNoise
-from vislam.frontend.placing import Placer
+from vislam.frontend.placing import NO_DEPTH, BlindKeyframe, Placer
 from vislam.frontend.result import CommonErrors, TrackResult, metric_motion, too_few
 from vislam.frontend.tracker import MIN_START_CORNERS
 from vislam.frontend.view import ImageDepth, View, sees, stereo_views
