@@ -13,8 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vislam.calibration.cameras.board import View, board_of
-from vislam.calibration.cameras.lens import LensFit, Model, direction_sigma_px, fit_lens
-from vislam.calibration.cameras.unified import WIDE
+from vislam.calibration.cameras.lens import WIDE, LensFit, Model, direction_sigma_px, fit_lens
 from vislam.calibration.cameras.views import Found, choose, find_views, images_of, live_images
 from vislam.calibration.options import CameraOptions
 from vislam.calibration.outcome import Folder, Outcome, refuse
