@@ -16,7 +16,7 @@ from vislam.core.angles import angle_between
 from vislam.core.camera import Rig
 from vislam.core.messages import Array
 from vislam.datasets.tables import Row
-from vislam.imu.rest import is_still
+from vislam.imu.resting import is_still
 
 Stamps = NDArray[np.int64]
 

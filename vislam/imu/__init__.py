@@ -12,8 +12,7 @@ from vislam.imu.condition import ConditionWatch, InertialCondition
 from vislam.imu.noise_floor import NoiseFloor, NoiseRatios, SeenNoise
 from vislam.imu.power_up import BiasMemory, PowerUp, Refusal, power_up
 from vislam.imu.preintegration import Preintegrated, pose_after, preintegrate
-from vislam.imu.rest import RestDetector, is_slow
-from vislam.imu.resting import state_at_rest
+from vislam.imu.resting import RestDetector, is_slow, state_at_rest
 from vislam.imu.series import ImuSeries, join, shifted, subtract_bias
 from vislam.imu.witness import MotionWitness
 

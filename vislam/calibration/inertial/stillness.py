@@ -1,7 +1,7 @@
 """When a hand-held or mounted sensor stood still, from its own samples (Tedaldi, Pretto, Menegatti, ICRA 2014).
 
 Their detector is the variance of force in a sliding window against a multiple of that at rest; here the rate has to be
-quiet as well, which separates a slow turn about the vertical from rest. `imu/rest.py` has limits instead of multiples,
+quiet as well, which separates a slow turn about the vertical from rest. `imu/resting.py` has limits, not multiples,
 also of the mean rate, which do not hold before calibration; and a pause is cut out to the sample here.
 """
 
