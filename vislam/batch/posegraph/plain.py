@@ -29,6 +29,10 @@ _SAME_COST = 1e-4  # relative: descents that end this near each other agree
 def grown_start(problem: PoseGraphProblem, reweigh: Reweigh | None = None) -> Array:
     """Return poses [N, d + 1, d + 1] that grew from the first one, each stretch optimised with all before it.
 
+    A graph with landmarks that were seen again after a long way has deep minima far from the best one, and no linear
+    start knows where landmarks are that only drifted poses saw; so it grows as in incremental smoothing (Kaess,
+    Ranganathan, Dellaert, "iSAM", T-RO 2008).
+
     `reweigh` gives the weights of the edges before each round, 1 without it, and may place landmarks again. Poses of
     another part of the graph than the first come last.
     """

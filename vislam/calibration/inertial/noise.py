@@ -85,6 +85,10 @@ def allan_curve(values: Array, rate_hz: float) -> AllanCurve:
 def fit_noise(curve: AllanCurve) -> NoiseFit:
     """Fit the fewest terms over the longest range of averaging times that explain a curve.
 
+    IEEE Std 952-1997, annex C: the Allan variance of a rate with white noise of density N, flicker of level B and
+    random walk of density K is `N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3`. Degrees of freedom after Stable32
+    (Riley, NIST SP 1065, section 5.4).
+
     Where nothing explains it, the best fit is taken and its sigmas are widened by the misfit.
     """
     tries = []
