@@ -25,7 +25,7 @@ from vislam.core.recording import Recording, WrappedRecording
 from vislam.pipeline.dark import dark
 from vislam.sim.motion.path import Travel, rounded_path, walk
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import Painter, SceneBuilder, paint, shell, signs
+from vislam.sim.scene import Painter, SceneBuilder, furniture, paint, signs
 from vislam.sim.worlds.simulation import open_world
 from vislam.sim.worlds.table import World
 from vislam.slam import Slam
@@ -66,11 +66,11 @@ def corridor(name: str, length_m: float) -> World:
         texels = round(200.0 * period_m) / period_m  # a whole number of pixels to the period
         for left, right in (((low, w), (high, w)), ((high, -w), (low, -w))):
             piece = repeated(_KINDS[name.partition("-")[0]](), period_m, int(rng.integers(0, 2**31)))
-            shell.wall(scene, left, right, HEIGHT_M, piece, texels)
+            furniture.wall(scene, left, right, HEIGHT_M, piece, texels)
         floor = repeated(paint.tiles((135, 150, 160), period_m / 2.0, 0.12), period_m, int(rng.integers(0, 2**31)))
-        shell.floor(scene, (low, -w), (high, w), floor, texels)
-        shell.ceiling(scene, (low, -w), (high, w), HEIGHT_M, paint.plain((185, 190, 190)), 90.0)
-        shell.wall(scene, (high, w), (high, -w), HEIGHT_M, paint.plain((150, 150, 150)))
+        furniture.floor(scene, (low, -w), (high, w), floor, texels)
+        furniture.ceiling(scene, (low, -w), (high, w), HEIGHT_M, paint.plain((185, 190, 190)), 90.0)
+        furniture.wall(scene, (high, w), (high, -w), HEIGHT_M, paint.plain((150, 150, 150)))
         return scene
 
     def motion(rng: np.random.Generator) -> BodySpline:

@@ -7,9 +7,9 @@ from vislam.core.errors import UsageError
 from vislam.core.geometry import invert, transform_points
 from vislam.sim.scene import paint
 from vislam.sim.scene.bake import bake
+from vislam.sim.scene.furniture import ceiling, floor, wall
 from vislam.sim.scene.render import Renderer
 from vislam.sim.scene.scene import SceneBuilder
-from vislam.sim.scene.shell import ceiling, floor, wall
 from vislam.sim.worlds.table import camera
 from worlds.recordings import frame_seconds
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from vislam.sim.motion.path import Travel, rounded_path, walk
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import SceneBuilder, furniture, paint, shell, signs
+from vislam.sim.scene import SceneBuilder, furniture, paint, signs
 
 _X, _Y, _Z = 10.5, 6.5, 2.6  # half sizes of the centre line, height
 _HALF_WIDTH_M = 1.15
@@ -34,8 +34,8 @@ def build(rng: np.random.Generator) -> SceneBuilder:
             base = paint.plaster(walls[index], skirts[(index + (ring is inner)) % 4], 0.95)
             if ring is outer and index == 1:
                 base = paint.brick((95, 115, 165))
-            hung = shell.hangings(rng, length, _Z, crowd=1.2)
-            shell.wall(world, left, right, _Z, signs.carrying(base, hung), 190.0)
+            hung = furniture.hangings(rng, length, _Z, crowd=1.2)
+            furniture.wall(world, left, right, _Z, signs.carrying(base, hung), 190.0)
     world.solids.append((np.array([0.0, 0.0, _Z / 2]), np.diag([inner[2][0] - 0.02, inner[0][1] - 0.02, _Z / 2])))
     _floors(world)
     _furniture(world, rng)
@@ -52,8 +52,8 @@ def _floors(world: SceneBuilder) -> None:
         ((-_X - w, -_Y + w), (-_X + w, _Y - w), paint.tiles((110, 120, 150), 0.45, 0.15)),
     )
     for low, high, painter in strips:
-        shell.floor(world, low, high, painter, 190.0)
-        shell.ceiling(world, low, high, _Z, paint.tiles((185, 190, 190), 0.6, 0.1), 90.0)
+        furniture.floor(world, low, high, painter, 190.0)
+        furniture.ceiling(world, low, high, _Z, paint.tiles((185, 190, 190), 0.6, 0.1), 90.0)
 
 
 def _furniture(world: SceneBuilder, rng: np.random.Generator) -> None:

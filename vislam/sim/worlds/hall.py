@@ -5,7 +5,7 @@ import numpy as np
 from vislam.core.messages import Array
 from vislam.sim.motion.path import Travel, rounded_path, smoothstep, wander
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import Hung, SceneBuilder, furniture, paint, shell, signs
+from vislam.sim.scene import Hung, SceneBuilder, furniture, paint, signs
 
 _X, _Y, _Z = 6.5, 4.5, 3.8  # half length, half width, height
 _BODY_HEIGHT_M = 0.3
@@ -103,8 +103,8 @@ def _shell(world: SceneBuilder, rng: np.random.Generator) -> None:
         (9.6, 6.9, 0.9, 0.6, signs.sign((225, 225, 225))), (10.6, 4.9, 1.0, 1.0, signs.stripes()),
         (5.7, 2.5, 1.3, 0.4, signs.stripes()), (1.5, 4.8, 0.9, 0.9, signs.sign((70, 150, 70))),
     ]  # fmt: skip
-    shell.floor(world, (-_X, -_Y), (_X, _Y), signs.carrying(paint.concrete(), marks))
-    shell.ceiling(world, (-_X, -_Y), (_X, _Y), _Z, paint.tiles((170, 175, 178), 0.6, 0.1))
+    furniture.floor(world, (-_X, -_Y), (_X, _Y), signs.carrying(paint.concrete(), marks))
+    furniture.ceiling(world, (-_X, -_Y), (_X, _Y), _Z, paint.tiles((170, 175, 178), 0.6, 0.1))
     cream, blue, green = (165.0, 190.0, 200.0), (150.0, 125.0, 90.0), (120.0, 145.0, 105.0)
     corners = ((-_X, _Y), (_X, _Y), (_X, -_Y), (-_X, -_Y))
     bases = (
@@ -116,7 +116,7 @@ def _shell(world: SceneBuilder, rng: np.random.Generator) -> None:
     for index, base in enumerate(bases):
         left, right = corners[index], corners[(index + 1) % 4]
         length = float(np.hypot(right[0] - left[0], right[1] - left[1]))
-        hung = shell.hangings(rng, length, _Z, crowd=1.3)
+        hung = furniture.hangings(rng, length, _Z, crowd=1.3)
         hung += [
             (
                 float(x),
@@ -127,7 +127,7 @@ def _shell(world: SceneBuilder, rng: np.random.Generator) -> None:
             )
             for x, k in zip(np.arange(0.6, length - 1.4, 2.1), rng.integers(0, 10, 40), strict=False)
         ]
-        shell.wall(world, left, right, _Z, signs.carrying(base, hung))
+        furniture.wall(world, left, right, _Z, signs.carrying(base, hung))
     for y in (2.1, -0.6):
         corner = (-_X + 0.02, y - 1.6, 3.0)
         world.rectangle(corner, (0.0, 1.6, 0.0), (0.0, 0.0, -1.3), signs.window(), 150.0, glow=0.8)

@@ -14,7 +14,7 @@ import numpy as np
 from vislam.core.messages import ImageU8
 from vislam.sim.motion.path import Travel, rounded_path, walk
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import Painter, SceneBuilder, furniture, paint, shell, signs
+from vislam.sim.scene import Painter, SceneBuilder, furniture, paint, signs
 
 _CENTRE_M = 5.6  # of the halls and of the corridors, from the middle of the block along x and y
 _HALL_M = 2.6  # half the side of a hall
@@ -84,15 +84,15 @@ def _quarter(layout: int, furnish: Callable[[SceneBuilder, np.random.Generator],
     )
     for left, right, base in runs:
         length = float(np.hypot(right[0] - left[0], right[1] - left[1]))
-        hung = shell.hangings(rng, length, _HEIGHT_M, crowd=1.3, doors=length > 5.0)
-        shell.wall(part, left, right, _HEIGHT_M, signs.carrying(base, hung), _TEXELS_PER_M)
+        hung = furniture.hangings(rng, length, _HEIGHT_M, crowd=1.3, doors=length > 5.0)
+        furniture.wall(part, left, right, _HEIGHT_M, signs.carrying(base, hung), _TEXELS_PER_M)
     ceiling = paint.tiles((185, 190, 190), 0.6, 0.1)
     for low, high, painter in (
         ((-(c - h), -c - w), (c - h, -c + w), paint.tiles((135, 150, 160), 0.3, 0.12)),
         ((c - h, -c - h), (c + h, -c + h), paint.concrete((125, 130, 125), 60.0)),
     ):
-        shell.floor(part, low, high, painter, _TEXELS_PER_M)
-        shell.ceiling(part, low, high, _HEIGHT_M, ceiling, 90.0)
+        furniture.floor(part, low, high, painter, _TEXELS_PER_M)
+        furniture.ceiling(part, low, high, _HEIGHT_M, ceiling, 90.0)
     for x, y in ((-1.8, -c), (1.8, -c), (c - 1.2, -c + 1.2), (c + 1.2, -c - 1.2)):
         furniture.ceiling_lamp(part, (x, y, _HEIGHT_M), (0.9, 0.3), float(rng.uniform(1.0, 1.6)))
     furnish(part, rng)

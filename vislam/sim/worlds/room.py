@@ -5,7 +5,7 @@ import numpy as np
 from vislam.core.messages import Array
 from vislam.sim.motion.path import smoothstep, wander
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.scene import Hung, SceneBuilder, furniture, paint, shell, signs
+from vislam.sim.scene import Hung, SceneBuilder, furniture, paint, signs
 
 _X, _Y, _Z = 3.0, 2.3, 2.6
 _DURATION_S = 34.0
@@ -74,8 +74,8 @@ def build(rng: np.random.Generator) -> SceneBuilder:
 
 def _shell(world: SceneBuilder, rng: np.random.Generator) -> None:
     carpet: list[Hung] = [(1.6, 3.3, 2.4, 1.7, signs.rug((70, 80, 140)))]
-    shell.floor(world, (-_X, -_Y), (_X, _Y), signs.carrying(paint.wood((75, 120, 170), 0.12), carpet), 260.0)
-    shell.ceiling(world, (-_X, -_Y), (_X, _Y), _Z, paint.tiles((205, 208, 210), 0.5, 0.08), 150.0)
+    furniture.floor(world, (-_X, -_Y), (_X, _Y), signs.carrying(paint.wood((75, 120, 170), 0.12), carpet), 260.0)
+    furniture.ceiling(world, (-_X, -_Y), (_X, _Y), _Z, paint.tiles((205, 208, 210), 0.5, 0.08), 150.0)
     corners = ((-_X, _Y), (_X, _Y), (_X, -_Y), (-_X, -_Y))
     bases = (
         paint.plaster((175, 200, 210)),
@@ -86,6 +86,6 @@ def _shell(world: SceneBuilder, rng: np.random.Generator) -> None:
     for index, base in enumerate(bases):
         left, right = corners[index], corners[(index + 1) % 4]
         length = float(np.hypot(right[0] - left[0], right[1] - left[1]))
-        hung = shell.hangings(rng, length, _Z, crowd=2.0, doors=index == 3)
-        shell.wall(world, left, right, _Z, signs.carrying(base, hung), 260.0)
+        hung = furniture.hangings(rng, length, _Z, crowd=2.0, doors=index == 3)
+        furniture.wall(world, left, right, _Z, signs.carrying(base, hung), 260.0)
     world.rectangle((_X - 0.02, -1.0, 2.25), (0.0, -1.2, 0.0), (0.0, 0.0, -1.2), signs.window(), 220.0, glow=0.85)
