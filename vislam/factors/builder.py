@@ -13,6 +13,7 @@ from vislam.core.messages import Array
 from vislam.factors import motion
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
+from vislam.factors.motion import start_factors
 from vislam.factors.noise_models import (
     DIRECTION_FLOOR_DEG,
     DIRECTION_SCALE_SIGMA,
@@ -22,7 +23,6 @@ from vislam.factors.noise_models import (
     inflated,
 )
 from vislam.factors.preintegration import Preintegrated, Preintegrator
-from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.imu import ImuNoise
 

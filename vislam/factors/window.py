@@ -14,9 +14,8 @@ from vislam.core.messages import Array
 from vislam.factors.builder import Guess, Label, Step
 from vislam.factors.journal import SPEED_MAX_M_S, StartRecord
 from vislam.factors.keys import X, bias_of, nearest_rigid
-from vislam.factors.motion import no_motion, on_floor
+from vislam.factors.motion import no_motion, on_floor, pose_covariance
 from vislam.factors.noise_models import gaussian, huber, inflated
-from vislam.factors.priors import pose_covariance
 from vislam.factors.visual import pose_factor
 
 _SPREAD = 1.5  # a provisional edge is worth replacing when its variance changed by more than this factor

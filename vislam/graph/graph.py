@@ -14,9 +14,9 @@ from vislam.core.messages import Array, ImuSpan, LoopDecision
 from vislam.factors.journal import LoopRecord, checked_pose, checked_span
 from vislam.factors.keys import B, L, V, X, bias_of
 from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.motion import ACCEL_BIAS_SIGMA_MAX, GYRO_BIAS_SIGMA_MAX
 from vislam.factors.noise_models import checked_covariance
 from vislam.factors.preintegration import Preintegrator
-from vislam.factors.priors import ACCEL_BIAS_SIGMA_MAX, GYRO_BIAS_SIGMA_MAX
 from vislam.graph.measurements import (
     RATIO_MAX,
     Between,

@@ -11,8 +11,8 @@ from vislam.core.messages import Array
 from vislam.factors.builder import Label, Step, read_guess
 from vislam.factors.keys import X, poses_of
 from vislam.factors.loop import LoopModel
+from vislam.factors.motion import held_pose
 from vislam.factors.odometry import Odometry
-from vislam.factors.priors import held_pose
 from vislam.factors.sensed import Readings
 
 Whole = tuple[gtsam.NonlinearFactorGraph, list[Label | None]]  # all factors, with their names

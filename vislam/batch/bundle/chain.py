@@ -18,7 +18,7 @@ from vislam.factors.builder import of_vision
 from vislam.factors.factor_log import FactorLog
 from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
-from vislam.factors.motion import SUBMAP_SIGMA_DEG
+from vislam.factors.motion import SUBMAP_SIGMA_DEG, start_factors
 from vislam.factors.noise_models import (
     DIRECTION_FLOOR_DEG,
     DIRECTION_SCALE_SIGMA,
@@ -27,7 +27,6 @@ from vislam.factors.noise_models import (
     huber,
 )
 from vislam.factors.preintegration import Preintegrator
-from vislam.factors.priors import start_factors
 from vislam.factors.visual import direction_as_pose, pose_factor
 
 Factors = list[gtsam.NonlinearFactor]

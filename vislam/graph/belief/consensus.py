@@ -23,8 +23,8 @@ from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.motion import GAUGE_SIGMA
 from vislam.factors.noise_models import gaussian
-from vislam.factors.priors import GAUGE_SIGMA
 from vislam.factors.solvers import FAILURES, Factorization, IncrementalSolver
 from vislam.factors.visual import pose_factor
 from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
