@@ -76,7 +76,7 @@ def detect_corners(
     rows, columns = np.nonzero(peaks)
     strengths = response[rows, columns]
     candidates = np.column_stack([columns, rows]).astype(np.float64)
-    rank = _rank_in_cells(candidates, strengths, _ORB_CELL_PX, image.shape[1])
+    rank = _rank_in_cells(candidates, strengths, cell_px, image.shape[1])
     order = np.lexsort((-strengths, rank))
     usable = live[np.isfinite(live).all(axis=1)]
     chosen = _choose_apart(candidates[order], usable, count, min_distance_px, image.shape[1], image.shape[0])

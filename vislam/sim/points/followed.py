@@ -38,7 +38,7 @@ Indices = NDArray[np.int64]
 _ANCHOR_M = 2.0  # the path is thinned to one anchor per cube of this side
 _PER_ANCHOR = 600  # points around each: with their neighbours', some 500 in a view of 80 x 60 degrees
 _LEAST = 6000  # points in all
-_NEAR_M, _MIDDLE_M, _FAR_M = 1.5, 8.0, 30.0  # walls and furniture between the first two, the rest of the hall beyond
+_WALLS_M, _HALL_M, _END_M = 1.5, 8.0, 30.0  # walls and furniture between the first two, the rest of the hall beyond
 _FAR_SHARE = 0.12
 _CLEARANCE_M = 0.9  # from the path: the body does not drive through things
 _REACH_M = 16.0  # anchors further away do not count
@@ -58,7 +58,7 @@ class LandmarkField:
         direction = rng.normal(size=(count, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         far = rng.random(count) < _FAR_SHARE
-        low, high = np.where(far, _MIDDLE_M, _NEAR_M), np.where(far, _FAR_M, _MIDDLE_M)
+        low, high = np.where(far, _HALL_M, _WALLS_M), np.where(far, _END_M, _HALL_M)
         distance = low * (high / low) ** rng.random(count)
         points = np.repeat(self._anchors, each, axis=0) + distance[:, None] * direction
         thinned = path_m[np.sort(np.unique(np.floor(path_m / 0.3).astype(np.int64), axis=0, return_index=True)[1])]
