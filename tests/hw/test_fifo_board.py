@@ -206,6 +206,17 @@ def test_a_sensor_that_gives_the_same_for_ever_is_noticed(kind: str) -> None:
         assert "gyro_stuck" not in driver.counters()
 
 
+def test_a_gyro_that_gives_the_same_for_ever_is_not_integrated() -> None:
+    def hung(t_ns: int):  # type: ignore[no-untyped-def]
+        return (0.0, 0.0, 0.5), *driving(t_ns)[1:]
+
+    with fifo_board(KINDS[0], truth=hung, grade="exact") as (driver, _, clock):
+        inertial, _ = collect(driver, clock, 2.0)
+        assert len(inertial) <= 20
+        assert driver.counters()["gyro_stuck"] >= 1
+        assert Health.GYRO_FAULT | Health.IMU_GAP | Health.IMU_MISSING in driver.health()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_saturation_is_told(kind: str) -> None:
     def violent(t_ns: int):  # type: ignore[no-untyped-def]

@@ -138,8 +138,11 @@ def test_a_chip_that_hangs_is_noticed(address: int, counter: str) -> None:
     with board(magnetometer=kind) as (driver, virtual, clock):
         collect(driver, clock, 0.5)
         virtual.chips[address].is_frozen = True
-        collect(driver, clock, 3.0)
+        inertial, _ = collect(driver, clock, 3.0)
         assert driver.counters()[counter] >= 1
+        if address == 0x68:
+            assert len(inertial) <= 40, "20 of the value, and 20 of what is in the registers once it was set up again"
+            assert Health.GYRO_FAULT | Health.IMU_GAP in driver.health()
         virtual.chips[address].is_frozen = False
         collect(driver, clock, 1.0)
         driver.health()

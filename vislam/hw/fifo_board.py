@@ -197,8 +197,7 @@ class FifoBoard:
         self._must_empty = False
         if raw is None or len(raw) == 0:
             if asked - link.newest_ns > self._config.silent_s * _NS:
-                self._links.counts["imu_silent"] += 1
-                link.drop(asked)
+                self._links.hung(link, "imu_silent", asked)
             return []
         link.newest_ns = self._clock.now_ns()  # not `asked`: a host put aside in between must not blame the chip
         made = self._samples.made(raw, asked, answered, self._links.counts)

@@ -12,7 +12,7 @@ from vislam.hw.chips import FifoImu
 from vislam.hw.chips.fifo_imu import SATURATED_LSB, RawSamples
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.link import STUCK_SAMPLES
+from vislam.hw.link import HELD_SAMPLES, STUCK_SAMPLES
 from vislam.hw.timing import SampleClock
 
 _QUESTIONS = 200  # of about the last second
@@ -75,14 +75,18 @@ class _Watch:
 
     name: str
     saturated: Health
+    fault: Health
     last: Array = field(default_factory=lambda: np.full(3, np.nan))
-    repeats: int = 0  # equal samples in a row
+    repeats: int = 0  # equal samples in a row ...
+    runs: list[int] = field(default_factory=list)  # ... up to each of those that were looked at last
 
     def looked(self, counts: Array, tallies: Counter[str]) -> Health:
         """Take counts [N, 3]; return the health bit of saturation."""
+        self.runs = []
         for row in counts:
             self.repeats = self.repeats + 1 if (row == self.last).all() else 0
             self.last = row
+            self.runs.append(self.repeats)
         beyond = int((abs(counts) >= SATURATED_LSB).any(axis=1).sum())
         if beyond:
             tallies[f"{self.name}_saturated"] += beyond
@@ -107,8 +111,8 @@ class FifoSamples:
         self.stamps = FifoStamps(config.rate_hz)
         self.zero = GyroZero()
         self.temperature_c: float | None = None  # smoothed over about a second
-        self._gyro = _Watch("gyro", Health.GYRO_SATURATED)
-        self._accel = _Watch("accel", Health.ACCEL_SATURATED)
+        self._gyro = _Watch("gyro", Health.GYRO_SATURATED, Health.GYRO_FAULT)
+        self._accel = _Watch("accel", Health.ACCEL_SATURATED, Health.ACCEL_FAULT)
         self._delay_ns = self._good_ns = 0
         self._back = 0.0  # share of a period from the accelerometer's time to the gyro's
         self._accel_before: Array | None = None
@@ -127,7 +131,8 @@ class FifoSamples:
         self._delay_ns, self._good_ns = round(delay_s * 1e9), good_from_ns
         self._back = (imu.gyro_delay_s - imu.accel_delay_s) * imu.rate_hz
         self._accel_before = None
-        self._gyro.repeats = self._accel.repeats = 0
+        for watch in (self._gyro, self._accel):
+            watch.repeats = min(watch.repeats, HELD_SAMPLES)  # until it gives another value
 
     def restart(self) -> None:
         """Samples were lost: the next ones are stamped without those before."""
@@ -144,17 +149,20 @@ class FifoSamples:
         `asked_ns` and `answered_ns` are around the question how many there are.
         """
         events = self._gyro.looked(raw.gyro, tallies) | self._accel.looked(raw.accel, tallies)
-        stuck = [watch.name for watch in (self._gyro, self._accel) if watch.repeats >= STUCK_SAMPLES]
-        for name in stuck:
-            tallies[f"{name}_stuck"] += 1
+        stuck = [watch for watch in (self._gyro, self._accel) if watch.repeats >= STUCK_SAMPLES]
+        for watch in stuck:
+            tallies[f"{watch.name}_stuck"] += 1
+            events |= watch.fault
+        if max(self._gyro.runs) >= HELD_SAMPLES:
+            events |= Health.IMU_GAP
         drift = self.zero.drift_rad_s(self.temperature_c)
         rates = raw.gyro @ self._gyro_map.matrix.T + self._gyro_map.offset - drift
         forces = self._at_gyro(raw.accel) @ self._accel_map.matrix.T + self._accel_map.offset
         stamps = self.stamps.of(len(raw), asked_ns, answered_ns)
         samples = [
             ImuSample(t_ns - self._delay_ns, rate, force)
-            for t_ns, rate, force in zip(stamps, rates, forces, strict=True)
-            if t_ns >= self._good_ns
+            for t_ns, rate, force, run in zip(stamps, rates, forces, self._gyro.runs, strict=True)
+            if t_ns >= self._good_ns and run < HELD_SAMPLES
         ]
         return Made(samples, events, bool(stuck))
 

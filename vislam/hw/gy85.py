@@ -23,7 +23,7 @@ from vislam.hw.chips import (
 )
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
-from vislam.hw.link import START_ATTEMPTS, STUCK_SAMPLES, ChipLinks, Link, refuse_shared
+from vislam.hw.link import HELD_SAMPLES, START_ATTEMPTS, STUCK_SAMPLES, ChipLinks, Link, refuse_shared
 from vislam.hw.timing import Clock, HostClock, SampleClock, read_in_rounds
 
 _NS = 1_000_000_000
@@ -242,9 +242,10 @@ class Gy85:
         is_repeated = tuple(counts) == self._last_counts
         link.repeats = link.repeats + 1 if is_repeated else 0
         self._last_counts = (counts[0], counts[1], counts[2])
-        if link.repeats >= STUCK_SAMPLES:
-            self._links.counts["gyro_stuck"] += 1
-            link.drop(asked)
+        if link.repeats >= HELD_SAMPLES:
+            self._links.events |= Health.IMU_GAP
+            if link.repeats >= STUCK_SAMPLES:
+                self._links.hung(link, "gyro_stuck", asked)
             return
         self._take_temperature(temperature)
         if max(map(abs, counts)) >= itg3205.LIMIT_LSB:
@@ -277,8 +278,7 @@ class Gy85:
             self._track.restart()
         if len(counts) == 0:
             if asked - link.newest_ns > self._config.silent_s * _NS:
-                self._links.counts["accel_silent"] += 1
-                link.drop(asked)
+                self._links.hung(link, "accel_silent", asked)
             return
         if (abs(counts) >= self._accel.limit_lsb).any():
             self._links.counts["accel_saturated"] += int((abs(counts) >= self._accel.limit_lsb).any(axis=1).sum())
@@ -291,8 +291,7 @@ class Gy85:
             link.repeats = link.repeats + 1 if (row == self._last_accel).all() else 0
             self._last_accel = row
         if link.repeats >= STUCK_SAMPLES:
-            self._links.counts["accel_stuck"] += 1
-            link.drop(asked)
+            self._links.hung(link, "accel_stuck", asked)
 
     def _merge(self) -> list[ImuSample]:
         """Return the gyro samples for which accelerometer samples lie on both sides, with those interpolated."""

@@ -34,6 +34,7 @@ from vislam.hw.bridge.protocol import (
 from vislam.hw.descriptor import received
 from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
+from vislam.hw.link import HELD_SAMPLES
 
 if TYPE_CHECKING:
     import socket
@@ -153,12 +154,8 @@ class SerialBridge:
 
     def counters(self) -> dict[str, int]:
         """Return how often each fault occurred since the start."""
-        found = (
-            self._counts
-            + self._passer.counts
-            + Counter(bad_frames=self._decoder.bad, clock_steps=self._clock.steps, stamps_doubted=self._clock.doubted)
-        )
-        return dict(found)
+        own = Counter(bad_frames=self._decoder.bad, clock_steps=self._clock.steps, stamps_doubted=self._clock.doubted)
+        return dict(self._counts + self._passer.counts + own)
 
     def close(self) -> None:
         """Close the port; may be called twice."""
@@ -191,7 +188,7 @@ class SerialBridge:
     def _wait_for_sample(self) -> None:
         end_ns = time.monotonic_ns() + round((self._config.start_s + 1.0) * _NS)
         found: list[ImuSample | MagSample] = []
-        while not self._newest_ns:
+        while not self._newest_ns and self._watches["gyro"].count < HELD_SAMPLES:  # a gyro that hangs is a fault
             left_ns = end_ns - time.monotonic_ns()
             found += self.read(min(max(left_ns / _NS, 0.0), _GLANCE_S))
             hopeless = self._other_version is not None or (self._port is None and self._counts["opened"] == 0)
@@ -303,9 +300,11 @@ class SerialBridge:
             samples.append(self._behind.field(raw, stamp_ns))
         if raw.status & (Status.ACCEL_ERROR | Status.GYRO_ERROR):
             self._events |= Health.IMU_GAP | Health.BUS_FAULT
-            return samples
-        samples.append(self._behind.inertial(raw, stamp_ns, self._zero.drift_rad_s(self._temperature_c)))
-        self._newest_ns = arrival_ns
+        elif self._watches["gyro"].count >= HELD_SAMPLES:
+            self._events |= Health.IMU_GAP
+        else:
+            samples.append(self._behind.inertial(raw, stamp_ns, self._zero.drift_rad_s(self._temperature_c)))
+            self._newest_ns = arrival_ns
         return samples
 
     def _note_status(self, raw: RawSample, hello: Hello) -> None:
@@ -333,7 +332,7 @@ class SerialBridge:
             if max(map(abs, raw.gyro)) >= hello.gyro_limit:
                 counts["gyro_saturated"] += 1
                 self._events |= Health.GYRO_SATURATED
-            if self._watches["gyro"].repeats((*raw.gyro, raw.temperature)) >= stuck:
+            if self._watches["gyro"].repeats(raw.gyro) >= stuck:
                 counts["gyro_stuck"] += 1
                 faults |= Health.GYRO_FAULT
             told_c = raw.temperature * hello.temperature_nk * 1e-9 + hello.temperature_mc * 1e-3
