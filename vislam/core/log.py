@@ -14,7 +14,6 @@ from logging.handlers import QueueHandler
 from pathlib import Path
 
 from vislam.core.errors import UsageError, VislamError, storage_failure
-from vislam.core.files import refuse_links_out
 from vislam.core.revision import version
 
 FILE_NAME = "log.txt"
@@ -65,6 +64,8 @@ def log_in_run(run: Path, command: Sequence[str]) -> AbstractContextManager[None
 
     Raises DataError for links that lead out of it.
     """
+    from vislam.core.files import refuse_links_out  # and numpy, which --help does without
+
     refuse_links_out(run)
     return log_to(run, command) if (run / "manifest.json").is_file() else nullcontext()
 

@@ -5,8 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from vislam.core.errors import DataError
 from vislam.core.geometry import so3_exp
@@ -110,6 +108,9 @@ def bodies_on(truth: Trajectory, t_ns: NDArray[np.int64]) -> list[BodyState]:
 
     Raises DataError where the path is too short.
     """
+    from scipy.interpolate import CubicSpline  # what reads a sensor's file does without
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     kept = [0]
     for k, stamp in enumerate(truth.t_ns.tolist()):
         if stamp - int(truth.t_ns[kept[-1]]) >= _KNOT_NS:
