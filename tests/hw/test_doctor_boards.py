@@ -1,5 +1,6 @@
 """What the doctor says of boards with a FIFO, and how verbs name them."""
 
+import errno
 import json
 import time
 from contextlib import closing
@@ -13,13 +14,15 @@ from vislam.cli import run_verb
 from vislam.config import BoardConfig, Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.hw.board_check import check_board
-from vislam.hw.chips import I2cBus, identify
+from vislam.hw.chips import BusError, I2cBus, identify
 from vislam.hw.chips.imus import KNOWN_IMUS
+from vislam.hw.chips.mpu6050 import Mpu6050
 from vislam.hw.doctor import HardwareReport, Wanted, _listen, examine
-from vislam.hw.emulator import SteppedClock, VirtualMpu6050, emulated_board, emulated_bus
+from vislam.hw.emulator import EmulatedBus, SensorError, SteppedClock, VirtualMpu6050, emulated_board, emulated_bus
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
 from vislam.hw.emulator.fifo_board import _KINDS
 from vislam.hw.fifo_board import FifoBoard
+from vislam.hw.health import Health
 from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
 from vislam.live.sources import open_live
 from vislam.runs.record import record
@@ -134,9 +137,54 @@ def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: py
     with emulated_bus(bus), closing(FifoBoard(config, clock, named="mpu6050-clone")) as board:
         findings = check_board(board, *_listen(board, 1.0, clock), path)
     good = "\n".join(f.what for f in findings if f.severity == "ok")
-    assert "MPU-6050 clone 0x98 passes its self-test: a clone, taken for an MPU-6500; its gyroscope's" in good
-    assert "scale shows in `vislam calibrate imu`; gravity is 9.8" in good
+    assert "MPU-6050 clone 0x98 passes its self-test: a clone, taken for an MPU-6500; gravity is 9.8" in good
+    assert "MPU-6050 clone 0x98 passes its self-test: the gyroscope responds with 1.00 1.00 1.00 of its trim" in good
     assert "gravity is measured as 9.8" in good
+
+
+@pytest.mark.parametrize(
+    ("who_am_i", "named", "lsb"), [(0x98, "mpu6050-clone", "1391 LSB, 2781"), (0x68, "mpu6050", "2145 LSB, 4289")]
+)
+def test_a_gyroscope_of_half_the_scale_is_a_fault(who_am_i: int, named: str, lsb: str) -> None:
+    clock = SteppedClock()
+    half = SensorError(scale=(0.5, 0.5, 0.5))
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, who_am_i=who_am_i)}, clock=clock)
+    with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:
+        findings = check_board(board, *_listen(board, 0.3, clock), bus.path)
+        assert board.health() == Health.GYRO_FAULT | Health.ACCEL_FAULT, "nothing else comes of the test"
+    (found,) = [f for f in findings if "fails its self-test" in f.what]
+    assert f"gyroscope's scale is off: x 0.50 of its trim ({lsb} asked), y 0.50" in found.what
+    assert found.next_step == "vislam calibrate imu"
+
+
+@pytest.mark.parametrize("every", [5, 9, 23])
+def test_a_self_test_on_a_disturbed_bus_leaves_the_settings(every: int) -> None:
+    clock = SteppedClock()
+    bus = emulated_board("MPU-6050", still, clock.now_ns, stepped=clock)
+    with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock)) as board:
+        bus.nack_every = every
+        assert board.run_self_tests() == ()
+        bus.nack_every = 0
+        forces = [np.linalg.norm(s.accel_m_s2) for s in _listen(board, 1.5, clock)[0]]
+        assert len(forces) > 100
+        np.testing.assert_allclose(forces, 9.8, atol=0.4)
+        assert bytes(bus.chips[0x68].registers[0x19:0x1D]) == bytes((4, 2, 0x08, 0x10))
+        assert [test.passed for test in board.run_self_tests()] == [True]
+
+
+def test_a_clone_is_tested_again_where_a_wire_was_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    once, own = [OSError(errno.EREMOTEIO, "no acknowledge")], Mpu6050.self_test
+
+    def disturbed(imu: Mpu6050, clock: Any) -> Any:
+        if once:
+            raise BusError("/dev/i2c-emulated", once.pop())
+        return own(imu, clock)
+
+    monkeypatch.setattr(Mpu6050, "self_test", disturbed)
+    clock = SteppedClock()
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, who_am_i=0x98)}, clock=clock)
+    with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named="mpu6050-clone")) as board:
+        assert ["gravity" in test.what for test in board.self_tests] == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -160,8 +208,8 @@ def test_gravity_decides_whether_the_scale_of_a_clone_fits(
                 FifoBoard(BoardConfig(bus="/dev/i2c-emulated"), clock, named="mpu6050-clone")
             return
         with closing(FifoBoard(BoardConfig(bus="/dev/i2c-emulated"), clock, named="mpu6050-clone")) as board:
-            (test,) = board.self_tests
-            assert test.passed is (True if outcome == "ok" else None)
+            test, own = board.self_tests
+            assert test.passed is own.passed is (True if outcome == "ok" else None)
             assert ("start it at rest" in test.what) == (outcome == "moves")
 
 

@@ -1,5 +1,7 @@
 """What chips with a FIFO say, byte by byte: decoding, pairing, scales, and what is written to their registers."""
 
+import errno
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -61,7 +63,8 @@ def alone(
 ) -> Iterator[tuple[Any, Any, EmulatedBus, SteppedClock]]:
     """Yield a driver, its virtual chip at the usual address, their bus and the clock that transfers move on."""
     clock = SteppedClock()
-    chip = virtual(still, clock.now_ns, **{k: options.pop(k) for k in ("who_am_i",) if k in options})
+    own = {k: options.pop(k) for k in ("who_am_i", "gyro", "accel") if k in options}
+    chip = virtual(options.pop("truth", still), clock.now_ns, **own)
     address = 0x6A if issubclass(virtual, VirtualLsm6dsox) else 0x69 if virtual is VirtualIcm20948 else 0x68
     bus = EmulatedBus({address: chip}, clock=clock, **options)
     with emulated_bus(bus):
@@ -173,6 +176,72 @@ def test_a_clone_is_named_by_its_register_and_taken_as_asked(who_am_i: int) -> N
         taken.configure(clock)
         assert taken.name == f"MPU-6050 clone 0x{who_am_i:02x}"
         assert chip.registers[0x1D] == 2, "the filter that an MPU-6500 has"
+
+
+HALF = SensorError(scale=(0.5, 0.5, 0.5))
+
+
+def tilting(t_ns: int):  # type: ignore[no-untyped-def]
+    return (0.0, 0.0, 0.0), (2e-9 * t_ns % 100.0, 0.0, 9.8), (20.0, 0.0, -42.0), 30.0
+
+
+def shaking(t_ns: int):  # type: ignore[no-untyped-def]
+    return (0.0, 0.1 * np.sin(t_ns * 1e-8), 0.0), (0.0, 0.0, 9.8), (20.0, 0.0, -42.0), 30.0
+
+
+@pytest.mark.parametrize("who_am_i", [0x68, 0x71, 0x98])
+@pytest.mark.parametrize(
+    ("options", "says", "passed", "words", "next_step"),
+    [
+        ({}, {}, True, "gyroscope responds with 1.00 1.00 1.00 .*; the accelerometer responds with 1.00 1.00 1.00", ""),
+        ({"gyro": HALF}, {}, False, r"gyroscope's scale is off: x 0.50 .* y 0.50 .* asked\), 0.*1", "calibrate imu"),
+        ({"accel": HALF}, {}, False, r"gyroscope responds.*accelerometer's scale is off: x 0.50", "calibrate imu"),
+        ({"gyro": SensorError(scale=(1.0, 1.0, 2.0))}, {}, False, "gyroscope's scale is off: z 2.00", "calibrate imu"),
+        ({}, {"codes": (0,) * 6}, None, "gyroscope's.*no trim.*accelerometer's.*no trim", "calibrate imu"),
+        ({}, {"codes": (7, 12, 20, 5, 0, 31)}, None, "gyroscope responds.*accelerometer's.*no trim", "calibrate imu"),
+        ({}, {"responds": False}, None, "gyroscope's scale cannot be judged: it does not respond", "calibrate imu"),
+        ({"truth": tilting}, {}, None, "accelerometer's scale cannot be judged: it moved", "stand still"),
+        ({"truth": shaking}, {}, None, "gyroscope's scale cannot be judged: it moved", "stand still"),
+    ],
+)
+def test_an_mpu_judges_its_scales_by_its_trims(
+    who_am_i: int, options: Any, says: dict[str, Any], passed: bool | None, words: str, next_step: str
+) -> None:
+    with alone(
+        mpu6050.Mpu6050, VirtualMpu6050, replace(SETUP, named="mpu6050-clone"), False, who_am_i=who_am_i, **options
+    ) as (driver, chip, _, clock):
+        for name, value in says.items():
+            setattr(chip, name, value)
+        driver.configure(clock)
+        before = bytes(chip.registers[:0x3A])
+        test = driver.self_test(clock)
+        assert test.passed is passed, test.what
+        assert re.search(words, test.what), test.what
+        assert next_step in test.next_step
+        assert bool(test.next_step) == bool(next_step)
+        assert bytes(chip.registers[:0x3A]) == before
+        clock.advance(50_000_000)
+        assert driver.waiting().units in (9, 10)
+
+
+def test_a_self_test_that_breaks_off_restores_an_mpu() -> None:
+    with alone(mpu6050.Mpu6050, VirtualMpu6050) as (driver, chip, bus, clock):
+        seen, take = set(), driver.take
+
+        def failing(units: int) -> Any:
+            seen.add(bytes(chip.registers[0x1B:0x1D]))
+            if len(seen) == 2:
+                raise BusError(bus.path, OSError(errno.EREMOTEIO, "no acknowledge"))
+            return take(units)
+
+        driver.take = failing
+        with pytest.raises(BusError):
+            driver.self_test(clock)
+        assert seen == {b"\x00\x10", b"\xe0\xf0"}, "250 deg/s and 8 g, then with the stimulus"
+        assert bytes(chip.registers[0x1B:0x1D]) == b"\x08\x10"
+        driver.take, chip.is_frozen = take, True
+        silent = driver.self_test(clock)
+        assert (silent.passed, silent.what) == (None, "fewer than 20 samples came in time")
 
 
 @pytest.mark.parametrize("who_am_i", [0x00, 0x19, 0xFF])

@@ -40,16 +40,16 @@ def check_board(
     def add(severity: Severity, what: str, next_step: str = "") -> None:
         findings.append(Finding(severity, what, where, next_step))
 
-    for test in board.self_tests:
+    for test in board.run_self_tests() if isinstance(board, FifoBoard) else board.self_tests:
         if test.passed is None:
-            add("warning", f"{test.chip}: {test.what}", "stand still and try again" if test.measured else "")
+            add("warning", f"{test.chip}: {test.what}", test.next_step)
         elif test.passed:
             add("ok", f"{test.chip} passes its self-test: {test.what}")
         else:
             add(
                 "warning",
                 f"{test.chip} fails its self-test: {test.what}",
-                "check its supply (3.3 V); replace the board",
+                test.next_step or "check its supply (3.3 V); replace the board",
             )
     for name, count in sorted(board.counters().items()):
         add("warning", f"{name}: {count}", _EXPLAINED.get(name, "see docs/sensors.md"))

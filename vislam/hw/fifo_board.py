@@ -20,7 +20,7 @@ from vislam.hw.chips import (
     lsm6dsox,
     mpu6050,
 )
-from vislam.hw.chips.fifo_imu import G_M_S2
+from vislam.hw.chips.fifo_imu import G_M_S2, SAMPLES, fresh
 from vislam.hw.chips.magnetometer import find_any_magnetometer
 from vislam.hw.fifo_samples import FifoSamples
 from vislam.hw.gyro_zero import GyroZero
@@ -32,32 +32,22 @@ _NS = 1_000_000_000
 _WATCH_S = 0.5  # between looks at temperature and settings
 _ASKED_PER_SAMPLE = 1.07  # no whole number: questions then sweep over the samples' phase, which narrows their times
 TOLERANCE_M_S2 = 1.0  # zero of an MPU-6050 out of the box: 0.8 m/s^2; a wrong range is off by half
-_SAMPLES, _MOST_PERIODS = 20, 80
 _MAX_STD_M_S2 = 0.3  # it moved
 
 
 def force_at_rest(imu: FifoImu, clock: Clock) -> float | None:
-    """Return what a chip measures of gravity (m/s^2); None where it moves or its samples do not come, in 80 periods.
-
-    Its FIFO must be emptied afterwards. Raises BusError.
-    """
-    period_ns = round(1e9 / imu.rate_hz)
-    clock.sleep_until(clock.now_ns() + round(imu.start_up_s * 1e9))
-    imu.empty()
-    counts = np.zeros((0, 3))
-    for _ in range(_MOST_PERIODS // 8):
-        clock.sleep_until(clock.now_ns() + 8 * period_ns)
-        counts = np.vstack([counts, imu.take(imu.waiting().units).accel])
-        if len(counts) >= _SAMPLES:
-            forces = counts * imu.accel_m_s2
-            return None if forces.std(axis=0).max() > _MAX_STD_M_S2 else float(np.linalg.norm(forces.mean(axis=0)))
-    return None
+    """Return what a chip measures of gravity (m/s^2); None where it moves or its samples do not come; see `fresh`."""
+    forces = fresh(imu, clock).accel * imu.accel_m_s2
+    if len(forces) < SAMPLES or forces.std(axis=0).max() > _MAX_STD_M_S2:
+        return None
+    return float(np.linalg.norm(forces.mean(axis=0)))
 
 
 def scale_test(imu: FifoImu, force_m_s2: float | None) -> SelfTest:
     """Return whether a force at rest is gravity."""
     if force_m_s2 is None:
-        return SelfTest(imu.name, None, f"{imu.doubt}; its scale is not known to fit: start it at rest", (0.0,))
+        what = f"{imu.doubt}; its scale is not known to fit: start it at rest"
+        return SelfTest(imu.name, None, what, next_step="stand still and try again")
     passed = abs(force_m_s2 - G_M_S2) <= TOLERANCE_M_S2
     what = f"gravity is {force_m_s2:.2f} m/s^2 by its scale, {G_M_S2:.2f} within {TOLERANCE_M_S2:g} expected"
     return SelfTest(imu.name, passed, f"{imu.doubt}; {what}", (force_m_s2,))
@@ -80,7 +70,7 @@ class FifoBoard:
 
         With `must_be_there` False a missing board is not an error: it is looked for as after unplugging. `named` is the
         chip's name on the command line, by which clones and chips of one id are known. Where the id does not settle the
-        scale, gravity does, if the chip is at rest when it is first set up.
+        scale, gravity and a clone's self-test do, if the chip is at rest when it is first set up.
 
         Raises:
             UsageError: a rate that no such board has.
@@ -127,6 +117,19 @@ class FifoBoard:
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
         """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT is set when it is far."""
         self._samples.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
+
+    def run_self_tests(self) -> tuple[SelfTest, ...]:
+        """Run the self-test of a chip whose driver has one, if it was not run; 0.6 s at rest, no samples meanwhile."""
+        link = self._imu_link
+        if isinstance(self._imu, mpu6050.Mpu6050) and link.is_up and link.self_test is None:
+            try:
+                link.self_test = self._imu.self_test(self._clock)
+                self.self_tests += (link.self_test,)
+            except BusError as error:
+                self._links.failed(link, error)
+                link.drop(self._clock.now_ns())  # its stimulus may still be on: set it up again
+            self._must_empty, self._last_out_ns = True, self._clock.now_ns()
+        return self.self_tests
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
@@ -234,7 +237,9 @@ class FifoBoard:
             test = scale_test(imu, force)
             if test.passed is False and is_asked:
                 raise HardwareError(f"{bus.path}: the {imu.name} does not fit: {test.what}; use another board")
-            self.self_tests = (test,)
+            if isinstance(imu, mpu6050.Mpu6050):
+                self._imu_link.self_test = imu.self_test(self._clock)
+            self.self_tests = (test,) if self._imu_link.self_test is None else (test, self._imu_link.self_test)
             imu.empty()
         self._samples.begin(imu, self._clock.now_ns() + round(imu.start_up_s * _NS))
         self._imu, self.rate_hz, self._must_empty = imu, imu.rate_hz, False

@@ -12,6 +12,7 @@ from vislam.hw.timing import Clock
 
 G_M_S2 = 9.80665
 SATURATED_LSB = 32767  # 16 bits; an axis at this value or beyond
+SAMPLES, _MOST_PERIODS = 20, 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +94,24 @@ class FifoImu(Protocol):
     def temperature_c(self) -> float:
         """Return the chip's temperature; raises BusError, and SettingsLostError where it lost its settings."""
         ...
+
+
+def fresh(imu: FifoImu, clock: Clock) -> RawSamples:
+    """Return `SAMPLES` and some more of a chip whose settings just changed; fewer where they do not come in 80 periods.
+
+    Its FIFO must be emptied afterwards. Raises BusError.
+    """
+    period_ns = round(1e9 / imu.rate_hz)
+    clock.sleep_until(clock.now_ns() + round(imu.start_up_s * 1e9))
+    imu.empty()
+    taken = NO_SAMPLES
+    for _ in range(_MOST_PERIODS // 8):
+        clock.sleep_until(clock.now_ns() + 8 * period_ns)
+        new = imu.take(imu.waiting().units)
+        taken = RawSamples(np.vstack([taken.gyro, new.gyro]), np.vstack([taken.accel, new.accel]))
+        if len(taken) >= SAMPLES:
+            break
+    return taken
 
 
 def next_of(asked: float, offered: dict[int, int]) -> int:

@@ -11,3 +11,4 @@ class SelfTest:
     passed: bool | None  # None: the chip has no self-test, or it could not be judged
     what: str  # measured against allowed, in words
     measured: tuple[float, ...] = ()  # per axis, in LSB
+    next_step: str = ""

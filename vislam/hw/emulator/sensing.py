@@ -76,7 +76,7 @@ class Sensing:
 
     def __init__(self, error: SensorError, seed: int) -> None:
         """Take the errors; same seed, same noise."""
-        self._error = error
+        self._error, self.scale = error, error.scale
         self._rows = [tuple(row) for row in error.matrix().tolist()]
         self._bias = list(error.bias)
         self._rng = np.random.default_rng(seed)
