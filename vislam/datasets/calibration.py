@@ -201,15 +201,13 @@ def read_pose(data: Mapping[str, Any], path: Path) -> Array:
 
 
 def pose_in(data: Mapping[str, Any], key: str, path: Path) -> Array | None:
-    """Return a pose [4, 4] of a file, also of its first three rows; None when it has none.
-
-    Raises DataError unless it is rigid.
-    """
+    """Return a pose [4, 4] of a file, also of three rows; None where it has none. DataError unless it is rigid."""
     if data.get(key) is None:
         return None
-    numbers = numbers_in(data, key, path)
-    numbers += [0.0, 0.0, 0.0, 1.0] * (len(numbers) == 12)
-    T = np.array(numbers_in({key: numbers}, key, path, 16)).reshape(4, 4)
+    value = data[key].get("data") if isinstance(data[key], dict) else data[key]
+    rows = 3 if len(_flat(value)) == 3 * 4 else 4
+    T = np.eye(4)
+    T[:rows] = np.reshape(numbers_in(data, key, path, 4 * rows), (rows, 4))
     if not are_rotations(T[:3, :3], 1e-3) or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise DataError(f"{path}: {key} is not a rigid transform: {T.tolist()}")
     return T
