@@ -6,12 +6,13 @@ Or behind the serial bridge: a process is the board, on a pseudo-terminal, and t
 import math
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from vislam.config import Gy85Config, SensorsConfig
+from vislam.core.errors import HardwareError
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.emulator import BridgeEmulator, LineFaults, SteppedClock, Truth, emulated_bus, emulated_gy85, gy85_errors
 from vislam.hw.gy85 import Gy85
@@ -122,9 +123,11 @@ def run_board(
 
 
 def open_board(port: Path) -> InertialSource:
-    """Open the port of `run_board`, once it is there; raises HardwareError as for a real one."""
+    """Open the port of `run_board`, once it is there and sends; raises HardwareError as for a real one."""
     deadline = time.monotonic() + _PLUGGED_S
-    while not port.exists() and time.monotonic() < deadline:
+    while time.monotonic() < deadline:  # its process may be put aside for longer than a board is silent
+        with suppress(HardwareError):
+            return open_inertial(f"serial:{port}", SensorsConfig())
         time.sleep(_POLL_S)
     return open_inertial(f"serial:{port}", SensorsConfig())
 
