@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 
 import numpy as np
 
@@ -55,10 +55,9 @@ def contradicted_extrinsics(
         seen: images of some frames that the run took, which may be other ones than on disk, if there are any.
         turns: rotations [3, 3] of the body by the gyroscope and by cam0; asked where there is nothing on disk.
     """
-    inner, findings = recording, list[Finding]()
+    findings = list[Finding]()
     try:
-        while isinstance(inner, Wrapping):
-            inner = inner.wrapped()
+        inner = _innermost(recording)
         is_file = isinstance(inner, FileRecording)
         asks_seen = bool(seen) and not (is_file and inner is recording)
         if asks_seen:
@@ -76,15 +75,16 @@ def contradicted_extrinsics(
 
 def misplaced_depth(recording: Recording) -> str:
     """Return how depth of a recording on disk lies elsewhere than stated, and what to do then; empty: it does not."""
-    while isinstance(recording, Wrapping):
-        recording = recording.wrapped()
-    if not isinstance(recording, FileRecording) or recording.survey.depth is None:
-        return ""
-    try:
-        place = misplaced(recording.survey, recording.rig)
-    except DataError:
-        return ""  # what cannot be read is said elsewhere
-    return "" if place is None else f"{misplaced_words(place)}: {MEND}"
+    with suppress(DataError):  # what cannot be read is said elsewhere
+        inner = _innermost(recording)
+        if isinstance(inner, FileRecording) and inner.survey.depth is not None:
+            place = misplaced(inner.survey, inner.rig)
+            return "" if place is None else f"{misplaced_words(place)}: {MEND}"
+    return ""
+
+
+def _innermost(recording: Recording) -> Recording:
+    return _innermost(recording.wrapped()) if isinstance(recording, Wrapping) else recording
 
 
 def _turns_of_run(turns: Sequence[tuple[Array, Array]], R_body_cam: Array) -> list[Finding]:

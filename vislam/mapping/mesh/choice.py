@@ -21,7 +21,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageU8
 from vislam.mapping.cloud.cloud import cells_of
 from vislam.mapping.cloud.mesh import Mesh
-from vislam.mapping.mesh.drawing import completed_depth
+from vislam.mapping.mesh.drawing import NEAR_M, completed_depth
 from vislam.mapping.mesh.posed import PosedView
 
 I64 = NDArray[np.int64]
@@ -33,7 +33,6 @@ _PATCH_M = 0.15  # edge of the cubes whose triangles vote together
 _MIN_FACING = 0.03  # cosine to the ray; noise turns triangles, and one that is turned away is taken for this
 _HIDDEN_M = 0.03  # behind the view's depth by more than this, and twice the noise of depth: something stands before it
 _NOISE_1M = 0.005
-_NEAR_M = 0.1  # before the camera; nearer things are not in focus
 _BRIGHT, WHITE = 225.0, 250.0  # of 255, the darkest channel: from here on details are lost, and here all are ...
 _OVEREXPOSED = 0.1  # ... and worth so much of another picture of it
 _AT_BORDER = 0.05  # where the view has no depth itself, or something hides a corner: colours of two things are mixed
@@ -113,7 +112,7 @@ def _is_clear(depth_m: F32, K: Array, point: tuple[float, float, float]) -> bool
 def _is_inside(depth_m: F32, K: Array, point: tuple[float, float, float]) -> bool:
     """Whether a point of the view's frame is in the image, with a margin."""
     x, y, z = point
-    if z <= _NEAR_M:
+    if z <= NEAR_M:
         return False
     u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
     rows, columns = depth_m.shape

@@ -10,7 +10,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.mapping.mesh.posed import PosedView
 
-_NEAR_M = 0.1  # before the camera; nearer things are not in focus
+NEAR_M = 0.1  # before the camera; nearer things are not in focus
 
 
 def seen_at(points_m: NDArray[np.floating], view: PosedView) -> tuple[Array, Array]:
@@ -26,7 +26,7 @@ def completed_depth(
 ) -> NDArray[np.float32]:
     """Return a view's depth [h, w] with that of the mesh where it has none itself, 0 where neither has."""
     pixels, z = seen_at(points_m, view)
-    nearness = np.where(z > _NEAR_M, 1.0 / np.maximum(z, _NEAR_M), 0.0)
+    nearness = np.where(z > NEAR_M, 1.0 / np.maximum(z, NEAR_M), 0.0)
     drawn = np.zeros((*view.depth_m.shape, 1))
     draw(pixels, nearness[:, None], triangles, drawn)
     rendered = np.divide(1.0, drawn[..., 0], out=np.zeros(view.depth_m.shape), where=drawn[..., 0] > 0.0)
