@@ -128,6 +128,7 @@ def trimmed() -> Iterator[None]:
     before = set(os.listdir("/proc/self/fd"))
     yield
     gc.collect()
+    gc.freeze()  # or the next module walks through what this one has imported and compiled
     with suppress(AttributeError):
         _LIBC.malloc_trim(0)
     left = set(os.listdir("/proc/self/fd")) - before
