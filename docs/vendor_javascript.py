@@ -17,10 +17,10 @@ VERSIONS = {"three": "0.187.0", "uplot": "1.6.32", "esbuild": "0.28.2"}
 ASSETS = Path(__file__).resolve().parent.parent / "vislam" / "runs" / "report" / "assets" / "vendor"
 ENTRIES = {  # global name: what is bundled, the rest is shaken off
     "THREE": (
-        "export { BufferAttribute, BufferGeometry, Color, ColorManagement, GridHelper, Group, Line, "
-        "LineBasicMaterial, "
-        "LineSegments, LinearSRGBColorSpace, Mesh, MeshBasicMaterial, PerspectiveCamera, Points, PointsMaterial, "
-        "Scene, SphereGeometry, Vector3, WebGLRenderer } from 'three';\n"
+        "export { BufferAttribute, BufferGeometry, Color, ColorManagement, DepthTexture, GridHelper, Group, Line, "
+        "LineBasicMaterial, LineSegments, LinearSRGBColorSpace, Mesh, MeshBasicMaterial, PerspectiveCamera, Points, "
+        "PointsMaterial, Scene, ShaderMaterial, SphereGeometry, Vector2, Vector3, WebGLRenderer, WebGLRenderTarget } "
+        "from 'three';\n"
         "export { OrbitControls } from 'three/examples/jsm/controls/OrbitControls.js';\n"
     ),
     "uPlot": "import uPlot from 'uplot';\nmodule.exports = uPlot;\n",

@@ -3,6 +3,7 @@
 import os
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from vislam.mapping.semantic.layer import LabelLayer
 from vislam.mapping.semantic.layer_files import write_layer
 from vislam.mapping.semantic.votes import voxel_keys
 from vislam.runs.report import write_report
+from vislam.trajectory import read_states_csv
 
 COLORS = """() => {
     const view = window.vislamReport.view, gl = view.renderer.getContext();
@@ -129,6 +131,65 @@ def test_the_map_turns_under_the_mouse(page):
     page.mouse.move(box["x"] + 420, box["y"] + 240, steps=4)
     page.mouse.up()
     page.wait_for_function(f"(before) => ({stands})().join() !== before.join()", arg=before)
+
+
+def test_the_view_goes_with_the_body_and_stays_where_it_is_left(page):
+    stands = "() => window.vislamReport.view.camera.position.toArray()"
+    away = (
+        "() => { const v = window.vislamReport.view; return v.camera.position.toArray()"
+        ".map((value, k) => value - v.marker.matrix.elements[12 + k]); }"
+    )
+    page.locator("#view-follow").click()
+    before, off = np.array(page.evaluate(stands)), np.array(page.evaluate(away))
+    page.evaluate("window.vislamReport.view.onTime(40.0)")
+    assert page.evaluate(away) == pytest.approx(off, abs=1e-6)
+    assert np.linalg.norm(np.array(page.evaluate(stands)) - before) > 0.1
+    page.locator("#view-follow").click()
+    before = page.evaluate(stands)
+    page.evaluate("window.vislamReport.view.onTime(20.0)")
+    assert page.evaluate(stands) == before
+    page.locator("#view-home").click()
+
+
+def test_a_distance_is_measured_between_two_points_of_the_map(page):
+    page.locator("#view-measure").click()
+    said = page.locator(".measured")
+    ends = []
+    for share in (0.4, 0.6):
+        box = page.locator("#view-canvas").bounding_box()
+        page.locator("#view-canvas").click(position={"x": share * box["width"], "y": 0.55 * box["height"]})
+        ends.append(page.evaluate("window.vislamReport.view.ends.at(-1).toArray()"))
+    step = np.subtract(*ends)
+    across, up = np.hypot(*step[:2]), -step[2]
+    assert said.inner_text() == f"{np.linalg.norm(step):.3f} m: {across:.3f} across, {up:.3f} up"
+    points = np.array(page.evaluate("Array.from(window.vislamReport.data.cloud.position)")).reshape(-1, 3)
+    assert max(np.linalg.norm(points - end, axis=1).min() for end in ends) == 0.0
+    page.locator("#view-measure").click()
+    assert not said.is_visible()
+
+
+def test_a_picture_is_kept_as_it_is_seen(page, tmp_path):
+    with page.expect_download() as kept:
+        page.locator("#view-picture").click()
+    kept.value.save_as(tmp_path / kept.value.suggested_filename)
+    picture = cv2.imread(str(tmp_path / "map.png"))
+    box = page.locator("#view-canvas").bounding_box()
+    assert picture.shape[:2] == (round(box["height"]), round(box["width"]))
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+
+
+def test_ellipsoids_are_as_large_as_the_covariance_says(page, report):
+    states = read_states_csv(report.parent / "states_graph.csv")[1]
+    drawn = np.array(
+        page.evaluate(
+            "() => Array.from(window.vislamReport.view.layers.get('sigmas').node.geometry.attributes.position.array)"
+        )
+    ).reshape(-1, 3 * 48, 3)
+    most = [np.linalg.norm(corners - corners.mean(axis=0), axis=1).max() for corners in drawn]
+    wanted = [3.0 * np.sqrt(np.linalg.eigvalsh(state.covariance[3:6, 3:6])[-1]) for state in states]
+    assert 10 < len(drawn) <= 80
+    assert most[0] == pytest.approx(wanted[0], rel=1e-3)
+    assert most[-1] == pytest.approx(wanted[-1], rel=1e-3)
 
 
 def test_a_loop_that_is_clicked_tells_its_reason(page):

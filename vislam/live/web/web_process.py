@@ -27,7 +27,10 @@ _MOST_ASKED = 16  # commands that may wait
 _MOST_VALUES = 6
 _MOST_VALUE = 64  # letters of a word that comes with a command
 COMMANDS = ("start", "stop", "calibrate", "next", "cancel")  # for the process that owns the run
-_SHARED = ("data.js", "view.js", "layers.js", "plots.js", "vendor/three.min.js", "vendor/uplot.min.js")
+_SHARED = (
+    "data.js", "shade.js", "shapes.js", "pick.js", "view.js", "tools.js", "layers.js", "plots.js",
+    "vendor/three.min.js", "vendor/uplot.min.js",
+)  # fmt: skip
 _OWN = ("live.js", "map.js", "plan.js", "wizard.js")
 _HEAD = (
     '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -53,9 +56,7 @@ _PAGE = (
     '<canvas id="view-canvas" aria-label="Map and trajectories in 3-D"></canvas>'
     '<div class="over" id="invalid" hidden><b>INVALID</b><span id="invalid-sigma"></span>'
     '<p id="invalid-reason"></p></div></div>'
-    '<div class="corner"><button type="button" id="view-home">Whole</button>'
-    '<button type="button" id="view-above">From above</button></div>'
-    '<div class="legend" id="view-layers"></div></div>'
+    '<div class="corner" id="view-tools"></div><div class="legend" id="view-layers"></div></div>'
     '<p class="note of-map" id="of-map"></p></div>'
     '<aside class="details"><img class="frame" id="picture" alt="What the camera sees" hidden>'
     '<p class="of-frame" id="of-picture"></p><div class="loop" id="loop" hidden></div>'

@@ -30,6 +30,7 @@ _MAX_POINTS = 350_000  # of the map: 3.7 MB of page
 _MAX_CLOUD_BYTES = 4 * 2**30
 _MAX_PATH = 4000  # poses of a line
 _MAX_LOOPS = 2000
+_MAX_ELLIPSOIDS = 80
 _MAX_TEXT = 400  # letters of one reason
 _FAR_QUANTILE = 0.002  # points beyond it on either side do not decide how large the picture is
 _STATES = tuple(Tracking)
@@ -133,6 +134,7 @@ def view_data(run: RunFiles, scene: Scene) -> dict[str, Any]:
         },
         "has_camera": run.has_camera,
         "tracking": _tracking(run, scene),
+        "sigmas": _sigmas(run, scene, best),
         "loops": _loops(run, scene),
         "cloud": _cloud(run, scene),
         "voxels": label_data(run, scene),
@@ -154,6 +156,22 @@ def _path(scene: Scene, t_ns: NDArray[np.int64], T: Array, with_rotation: bool) 
     t_ns, T = _thin(t_ns), _thin(T)
     out = {"t": floats(scene.seconds(t_ns)), "xyz": floats(T[:, :3, 3])}
     return {**out, "R": floats(T[:, :3, :3])} if with_rotation else out
+
+
+def _sigmas(run: RunFiles, scene: Scene, best: str) -> dict[str, str]:
+    """Return half axes of three sigmas of the position, evenly along the best path, if it has covariances."""
+    states = run.states.get("ekf" if best == "ekf" else "graph", [])
+    path = scene.paths[best]
+    states = [state for state in states if path.t_ns[0] <= state.t_ns <= path.t_ns[-1]]
+    states = [states[k] for k in np.linspace(0, len(states) - 1, min(len(states), _MAX_ELLIPSOIDS)).round().astype(int)]
+    covariances = np.array([state.covariance[3:6, 3:6] for state in states]).reshape(-1, 3, 3)
+    good = np.isfinite(covariances).all(axis=(1, 2))
+    if not good.any():
+        return {}
+    variances, directions = np.linalg.eigh(covariances[good])
+    axes = scene.S_scene_map[:3, :3] @ (3.0 * np.sqrt(np.maximum(variances, 0.0))[:, None] * directions)
+    places = path.at(np.array([state.t_ns for state in states])[good])[:, :3, 3]
+    return {"xyz": floats(places), "axes": floats(axes)}
 
 
 def _tracking(run: RunFiles, scene: Scene) -> dict[str, Any]:

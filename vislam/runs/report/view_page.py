@@ -10,7 +10,10 @@ from vislam.runs.report.page_assets import assets
 from vislam.runs.report.view_data import as_script
 
 # each may use those before it
-_MODULES = ("data.js", "view.js", "layers.js", "plots.js", "details.js", "labels.js", "sort.js", "main.js")
+_MODULES = (
+    "data.js", "shade.js", "shapes.js", "pick.js", "view.js", "tools.js", "layers.js", "plots.js", "details.js",
+    "labels.js", "sort.js", "main.js",
+)  # fmt: skip
 _LIBRARIES = ("vendor/three.min.js", "vendor/uplot.min.js")
 
 
@@ -30,9 +33,7 @@ def view_elements(data: dict[str, Any]) -> str:
         '<div class="view" id="view"><div class="stage">'
         '<div class="canvas"><div class="surface">'
         '<canvas id="view-canvas" aria-label="Map and trajectories in 3-D"></canvas></div>'
-        '<div class="corner"><button type="button" id="view-home">Whole</button>'
-        '<button type="button" id="view-above">From above</button></div>'
-        '<div class="legend" id="view-layers"></div></div>'
+        '<div class="corner" id="view-tools"></div><div class="legend" id="view-layers"></div></div>'
         '<div class="time"><button type="button" id="view-play">Play</button>'
         '<input type="range" id="view-time" min="0" max="1" step="any" value="0" aria-label="Time">'
         '<output id="view-now"></output></div></div>'

@@ -4,6 +4,7 @@ import { layerButtons } from "./layers.js";
 import { LiveMap } from "./map.js";
 import { Plan } from "./plan.js";
 import { Plots } from "./plots.js";
+import { viewTools } from "./tools.js";
 import { View } from "./view.js";
 import { Wizard } from "./wizard.js";
 
@@ -214,6 +215,7 @@ function draw() {
   if (!page.view) {
     try {
       page.view = new View(at("view-canvas"), data);
+      viewTools(page.view, at("view-tools"), (touched) => (page.touched = touched));
     } catch (error) {
       document.documentElement.classList.add("flat"); // no WebGL here
       page.view = new Plan(at("view-canvas"), data);
@@ -285,14 +287,6 @@ async function turn() {
 if (location.hash) history.replaceState(null, "", "/"); // the token, where one had signed in before
 document.documentElement.classList.add("live");
 page.wizard = new Wizard(at("wizard"), command);
-at("view-home").addEventListener("click", () => {
-  page.touched = false;
-  if (page.view) page.view.overview();
-});
-at("view-above").addEventListener("click", () => {
-  page.touched = true;
-  if (page.view) page.view.fromAbove();
-});
 window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   if (page.view) page.view.paint();
   if (page.plots) page.plots.paint();

@@ -55,6 +55,7 @@ export function readData() {
     seen.reason = shorts(seen.reason);
   }
   data.loops.ends = floats(data.loops.ends);
+  if (data.sigmas.xyz) data.sigmas = { xyz: floats(data.sigmas.xyz), axes: floats(data.sigmas.axes) };
   data.keyframes = floats(data.keyframes);
   return data;
 }

@@ -5,6 +5,7 @@ import { addLabels } from "./labels.js";
 import { layerButtons } from "./layers.js";
 import { Plots } from "./plots.js";
 import { sortTables } from "./sort.js";
+import { viewTools } from "./tools.js";
 import { View } from "./view.js";
 
 const PLAY_MS = 50;
@@ -68,8 +69,7 @@ function start() {
   if (view) {
     addLabels(view, data.voxels, at("view-layers").parentElement);
     layerButtons(view, at("view-layers"));
-    at("view-home").addEventListener("click", () => view.overview());
-    at("view-above").addEventListener("click", () => view.fromAbove());
+    viewTools(view, at("view-tools"));
   }
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   dark.addEventListener("change", () => {

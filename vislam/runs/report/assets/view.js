@@ -1,6 +1,9 @@
 // The map and the trajectories in 3-D. Draws only when something has changed; while it turns, only as many points as
 // the machine can draw 20 times a second.
 import { DECISIONS, LOOP_COLORS, color, nearest } from "./data.js";
+import { loopAt, pointAt, timeAt } from "./pick.js";
+import { Shade, round } from "./shade.js";
+import { arrow, bands, ellipsoids, pyramid } from "./shapes.js";
 
 /* global THREE */
 
@@ -11,6 +14,7 @@ const PATH_WIDTH = 0.003; // half of it, in radii of the scene: lines of WebGL h
 const HIDDEN = ["rejected", "undone"]; // until one asks for them
 const MOUSE = { hits: 9, rolls: 5 }; // px: so far from a loop a click still means it, and so far the mouse may move
 const FINGER = { hits: 22, rolls: 12 };
+const FORWARD = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]; // a camera that looks along x of the body
 
 export class View {
   constructor(canvas, data) {
@@ -19,6 +23,7 @@ export class View {
     this.canvas = canvas;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    this.shade = new Shade(this.renderer);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(45, 1, 0.01, 1000);
     this.camera.up.set(0, 0, 1);
@@ -40,8 +45,10 @@ export class View {
     this.addGrid();
     this.addCloud();
     this.addPaths();
+    this.addSigmas();
     this.addLoops();
     this.addMarker();
+    this.span(this.ends || []);
     this.controls.maxDistance = 12 * this.reach;
     this.controls.minDistance = 0.02 * this.reach;
   }
@@ -109,6 +116,8 @@ export class View {
     // as large as points that lie evenly on surfaces of this extent would have to be to close them
     this.pointSize = (6.2 * this.reach) / Math.sqrt(Math.max(cloud.count, cloud.usual || 0));
     const material = new THREE.PointsMaterial({ vertexColors: true, size: this.pointSize });
+    round(material);
+    this.pointSize = material.size;
     this.points = new THREE.Points(geometry, material);
     this.points.frustumCulled = false;
     this.add("map", this.points, "Map", "muted");
@@ -143,6 +152,14 @@ export class View {
     }
   }
 
+  // Where the body is with a probability of 97 %, as its covariance has it.
+  addSigmas() {
+    const { sigmas } = this.data;
+    if (!sigmas || !sigmas.xyz) return;
+    const node = this.line(ellipsoids(sigmas.xyz, sigmas.axes), "accent", 0.8, THREE.LineSegments);
+    this.add("sigmas", node, "Uncertainty, 3 σ", "accent", false);
+  }
+
   addLoops() {
     const { rows, ends } = this.data.loops;
     this.loopNodes = {};
@@ -166,7 +183,7 @@ export class View {
 
   addMarker() {
     const size = 0.07 * this.reach;
-    const segments = this.data.has_camera === false ? this.arrow(size) : this.pyramid(size);
+    const segments = this.data.has_camera === false ? arrow(size) : pyramid(size, this.data.camera || FORWARD);
     const shape = this.line(new Float32Array(segments), "accent", 1, THREE.LineSegments);
     const ball = new THREE.Mesh(new THREE.SphereGeometry(0.011 * this.reach, 16, 12), new THREE.MeshBasicMaterial());
     this.painted.push([ball.material, "accent"]);
@@ -178,26 +195,6 @@ export class View {
     this.marker.matrixAutoUpdate = false;
     this.marker.add(shape, ball);
     this.scene.add(this.marker);
-  }
-
-  // Along x of a body without a camera.
-  arrow(size) {
-    const [tip, back, side] = [[size, 0, 0], 0.7 * size, 0.2 * size];
-    return [0, 0, 0, ...tip, ...tip, back, side, 0, ...tip, back, -side, 0];
-  }
-
-  // What the camera sees.
-  pyramid(size) {
-    const depth = size;
-    const [w, h] = [0.62 * size, 0.46 * size];
-    const T = this.data.camera || [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]];
-    const place = (x, y, z) => [0, 1, 2].map((k) => T[k][0] * x + T[k][1] * y + T[k][2] * z + T[k][3]);
-    const eye = place(0, 0, 0);
-    const corners = [[-w, -h], [w, -h], [w, h], [-w, h]].map(([x, y]) => place(x, y, depth));
-    const segments = [];
-    corners.forEach((corner, k) => segments.push(...eye, ...corner, ...corner, ...corners[(k + 1) % 4]));
-    segments.push(...corners[0], ...place(0, -1.5 * h, depth), ...place(0, -1.5 * h, depth), ...corners[1]);
-    return segments;
   }
 
   addControls() {
@@ -286,7 +283,7 @@ export class View {
       this.points.geometry.setDrawRange(0, Math.round(part * count));
       this.points.material.size = this.pointSize / Math.sqrt(part); // fewer points, as much of the surface
     }
-    this.renderer.render(this.scene, this.camera);
+    this.shade.render(this.scene, this.camera);
     if (!this.moving) return;
     // reading one pixel waits for the picture: what calls alone take says nothing about software rendering
     const gl = this.renderer.getContext();
@@ -300,7 +297,7 @@ export class View {
     const gl = this.renderer.getContext();
     const begun = performance.now();
     for (let k = 0; k < times; k++) {
-      this.renderer.render(this.scene, this.camera);
+      this.shade.render(this.scene, this.camera);
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     }
     return (performance.now() - begun) / times;
@@ -316,6 +313,42 @@ export class View {
   setPose(R, [x, y, z]) {
     this.marker.matrix.set(R[0], R[1], R[2], x, R[3], R[4], R[5], y, R[6], R[7], R[8], z, 0, 0, 0, 1);
     this.marker.matrixWorldNeedsUpdate = true;
+    const stands = new THREE.Vector3(x, y, z);
+    if (this.follows) this.goWith(stands.clone().sub(this.stands));
+    this.stands = stands;
+    this.ask();
+  }
+
+  // Look at the body from so many radii of the scene and stay with it; 0: no more.
+  follow(radii) {
+    this.follows = radii > 0;
+    if (!this.follows || !this.stands) return;
+    const way = this.camera.position.clone().sub(this.controls.target).normalize();
+    this.look(this.stands, way, radii * this.reach);
+  }
+
+  goWith(step) {
+    this.camera.position.add(step);
+    this.controls.target.add(step);
+    this.controls.update();
+  }
+
+  // A line between two points, or one of them.
+  span(ends) {
+    this.ends = ends;
+    if (this.spanned) this.scene.remove(this.spanned);
+    const points = ends.length ? [ends[0], ends[ends.length - 1]] : [];
+    const xyz = new Float32Array(points.flatMap((end) => end.toArray()));
+    this.spanned = this.line(xyz, "accent", 1, THREE.LineSegments);
+    const dots = new THREE.Points(this.spanned.geometry, new THREE.PointsMaterial({ size: 9, sizeAttenuation: false }));
+    for (const node of [this.spanned, dots]) {
+      node.material.depthTest = false;
+      node.material.color.set(color("accent"));
+      node.renderOrder = 5;
+    }
+    dots.frustumCulled = false;
+    this.spanned.add(dots);
+    this.scene.add(this.spanned);
     this.ask();
   }
 
@@ -344,57 +377,15 @@ export class View {
 
   click(event, hits) {
     const box = this.canvas.getBoundingClientRect();
-    const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-    let best = [hits, null];
-    for (const node of Object.values(this.loopNodes)) {
-      if (!node.visible) continue;
-      for (const k of node.userData.indices) {
-        const e = this.data.loops.ends.subarray(6 * k, 6 * k + 6);
-        const [a, b] = [this.project(e[0], e[1], e[2]), this.project(e[3], e[4], e[5])];
-        if (!a || !b) continue;
-        const [dx, dy] = [b[0] - a[0], b[1] - a[1]];
-        const share = Math.min(1, Math.max(0, ((x - a[0]) * dx + (y - a[1]) * dy) / (dx * dx + dy * dy || 1)));
-        const away = Math.hypot(a[0] + share * dx - x, a[1] + share * dy - y);
-        if (away < best[0]) best = [away, k];
-      }
+    const at = [event.clientX - box.left, event.clientY - box.top];
+    if (this.onPoint) {
+      const point = pointAt(this, at, hits);
+      if (point) this.onPoint(point);
+      return;
     }
-    if (best[1] !== null && this.onLoop) this.onLoop(best[1]);
-    else this.clickPath(x, y, 2 * hits);
+    const loop = loopAt(this, at, hits);
+    if (loop !== null && this.onLoop) return this.onLoop(loop);
+    const t = timeAt(this, at, 2 * hits);
+    if (t !== null && this.onTime) this.onTime(t);
   }
-
-  clickPath(x, y, hits) {
-    const path = this.data.paths[this.data.best];
-    if (!path.t) return;
-    let best = [hits, null];
-    for (let k = 0; k < path.t.length; k++) {
-      const p = this.project(path.xyz[3 * k], path.xyz[3 * k + 1], path.xyz[3 * k + 2]);
-      const away = p ? Math.hypot(p[0] - x, p[1] - y) : Infinity;
-      if (away < best[0]) best = [away, path.t[k]];
-    }
-    if (best[1] !== null && this.onTime) this.onTime(best[1]);
-  }
-}
-
-// Two triangles for each step of a path and each of two directions across it; steps shorter than the width are joined.
-function bands(xyz, width) {
-  const out = [];
-  const [a, b, along, up, across] = Array.from({ length: 5 }, () => new THREE.Vector3());
-  const least = width * width;
-  a.set(xyz[0], xyz[1], xyz[2]);
-  for (let k = 3; k < xyz.length; k += 3) {
-    b.set(xyz[k], xyz[k + 1], xyz[k + 2]);
-    along.copy(b).sub(a);
-    if (!(along.lengthSq() >= least)) continue;
-    up.set(0, 0, 1);
-    if (Math.abs(along.z) > 0.9 * along.length()) up.set(1, 0, 0);
-    across.copy(along).cross(up).normalize();
-    up.copy(across).cross(along).normalize();
-    for (const side of [across, up]) {
-      const [x, y, z] = [side.x * width, side.y * width, side.z * width];
-      const corners = [[a, 1], [a, -1], [b, 1], [b, 1], [a, -1], [b, -1]];
-      for (const [p, s] of corners) out.push(p.x + s * x, p.y + s * y, p.z + s * z);
-    }
-    a.copy(b);
-  }
-  return new Float32Array(out);
 }
