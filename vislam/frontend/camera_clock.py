@@ -10,7 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from vislam.config import InitConfig
+from vislam.core.geometry import invert, se3_adjoint
 from vislam.core.messages import Frame, ImuSpan, NavState, VoMeasurement
+from vislam.frontend.stamp_jitter import StampJitter
 from vislam.frontend.time_offset import TimeOffset, TimeOffsetEstimate
 from vislam.imu import ImuBuffer
 
@@ -35,7 +37,7 @@ class CameraClock:
     def __init__(self, config: InitConfig) -> None:
         """Start from the configured offset."""
         self._config = config
-        self._offset = TimeOffset(config)
+        self._offset, self._jitter = TimeOffset(config), StampJitter()
         self.applied_ns = round(config.time_offset_s * _NS)
         self.drift = 0.0
         self.changes = 0
@@ -43,6 +45,7 @@ class CameraClock:
         self._offset_t_ns = 0  # ... since which the drift counts
         self._corrected_ns = 0  # by changes of the offset so far ...
         self._keyframe_ns = 0  # ... and when the newest keyframe was stamped
+        self._twist = self._keyframe_twist = np.zeros(6)  # of the body at the newest frame and keyframe
         self._frames = 0
         self._wanted_before_ns = 0  # the significant change that rotations asked for last
         self._last_t_ns: int | None = None  # of the frame before, by the camera
@@ -72,6 +75,11 @@ class CameraClock:
         """How far the applied offset may be off."""
         return self._offset.sigma_s
 
+    @property
+    def jitter_s(self) -> float:
+        """Standard deviation of single stamps."""
+        return self._jitter.sigma_s
+
     def start_at(self, applied_s: float, sigma_s: float) -> None:
         """Take the offset that an earlier run applied and how well it knew that."""
         self.applied_ns = self._offset_ns = round(applied_s * _NS)
@@ -82,12 +90,13 @@ class CameraClock:
         if self._last_t_ns is not None:
             self._interval_ns = frame.t_ns - self._last_t_ns
         self._last_t_ns = frame.t_ns
+        self._jitter.stamp(frame.t_ns)
         self.applied_ns = self.offset_ns(frame.t_ns)
         return replace(frame, t_ns=frame.t_ns + self.applied_ns) if self.applied_ns else frame
 
     def took_keyframe(self) -> None:
         """Take note that the newest frame became a keyframe."""
-        self._keyframe_ns = self._corrected_ns
+        self._keyframe_ns, self._keyframe_twist = self._corrected_ns, self._twist
 
     def gyro_sigma_rad_s(self, span: ImuSpan) -> float:
         """Return the sigma of a mean rate over a span for want of the exact time: it grows with the change of rate."""
@@ -95,15 +104,29 @@ class CameraClock:
         return _WIDER * self.sigma_s * change / ((int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS)
 
     def loosened(self, vo: VoMeasurement, span: ImuSpan | None, state: NavState | None) -> VoMeasurement:
-        """Return a motion with the noise that comes of two stamps made with different offsets; usually as it is."""
-        shift_s = abs(self._corrected_ns - self._keyframe_ns) / _NS
-        if shift_s == 0.0 or vo.T_keyframe_body is None:
+        """Return a motion with the noise that comes of its two stamps; usually as it is.
+
+        Each is off by its jitter, and two that were made with different offsets by the difference.
+        """
+        self._jitter.see(vo, span, np.zeros(3) if state is None else state.gyro_bias_rad_s)
+        if vo.T_keyframe_body is None:
             return vo
-        rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
-        speed = _FASTEST_M_S if state is None else float(np.linalg.norm(state.velocity_world_m_s))
-        along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way says nothing then
-        extra = np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
-        return replace(vo, covariance=vo.covariance + extra)
+        jitter_s, shift_s = self._jitter.sigma_s, abs(self._corrected_ns - self._keyframe_ns) / _NS
+        self._twist = np.zeros(6)
+        if span is not None:
+            self._twist[:3] = span.gyro_rad_s.mean(axis=0)
+        if state is not None and vo.has_scale:  # of a way without scale the direction stays
+            self._twist[3:] = state.T_world_body[:3, :3].T @ state.velocity_world_m_s
+        extra = np.zeros((6, 6))
+        if jitter_s > 0.0:
+            for twist in (self._twist, se3_adjoint(invert(vo.T_keyframe_body)) @ self._keyframe_twist):
+                extra += jitter_s**2 * np.outer(twist, twist)
+        if shift_s > 0.0:
+            rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
+            speed = _FASTEST_M_S if state is None else float(np.linalg.norm(state.velocity_world_m_s))
+            along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way says nothing then
+            extra += np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
+        return replace(vo, covariance=vo.covariance + extra) if extra.any() else vo
 
     def follow(self, vo: VoMeasurement, buffer: ImuBuffer, is_started: bool) -> int:
         """Learn from the newest frame's motion and return by how many ns the applied offset changes from now on.

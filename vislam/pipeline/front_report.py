@@ -267,6 +267,8 @@ def _learned_of_camera(front: Front) -> dict[str, float]:
         return mount
     clock = front.camera_clock
     found = {"camera_offset_s": clock.applied_s, "camera_offset_sigma_s": clock.sigma_s}
+    if clock.jitter_s > 0.0:
+        found["stamp_jitter_s"] = clock.jitter_s
     if clock.drift_sigma > 0.0:
         found |= {"camera_drift": clock.drift, "camera_drift_sigma": clock.drift_sigma}
     return found | _turned(clock, front.learned.filter_camera, front.config.ekf) | mount
