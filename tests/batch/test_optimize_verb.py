@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import asdict, replace
+from itertools import takewhile
 from multiprocessing import get_context
 
 import numpy as np
@@ -178,7 +179,7 @@ class _Start:
 
     def events(self):
         first = next(iter(self._recording.events())).t_ns
-        return (v for v in self._recording.events() if (v.t_ns - first) * 1e-9 < self._seconds)
+        return takewhile(lambda v: (v.t_ns - first) * 1e-9 < self._seconds, self._recording.events())
 
 
 @pytest.mark.parametrize(

@@ -124,12 +124,13 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     made = {}
     for world, seed, duration_s in (("handheld-room", 3, 14.0), ("corridor-loop", 1, 20.0)):
         made[world] = tmp_path_factory.mktemp(world)
-        record(open_world(world, seed, rig="mono", duration_s=duration_s, camera_hz=10.0, workers=2), made[world])
+        options = {"rig": "mono", "duration_s": duration_s, "camera_hz": 10.0, "image_width_px": 320}
+        record(open_world(world, seed, workers=2, **options), made[world])
     return made
 
 
 def spoilt(source: Path, root: Path, factor: float, turn: np.ndarray, late_s: float) -> Path:
-    """Copy cam0 and imu0 with a wrong focal length, mount or clock."""
+    """Copy cam0, up to 200 images of it, and imu0 with a wrong focal length, mount or clock."""
     for name in ("cam0", "imu0"):
         (root / "mav0" / name).mkdir(parents=True)
         for file in ("data.csv", "sensor.yaml"):
@@ -143,7 +144,7 @@ def spoilt(source: Path, root: Path, factor: float, turn: np.ndarray, late_s: fl
     sensor["intrinsics"] = [factor * f for f in sensor["intrinsics"][:2]] + sensor["intrinsics"][2:]
     (cam0 / "sensor.yaml").write_text(yaml.safe_dump(sensor))
     head, *lines = (cam0 / "data.csv").read_text().splitlines()
-    stamped = [line.split(",") for line in lines]
+    stamped = [line.split(",") for line in lines[:200]]
     late_ns = round(1e9 * late_s)
     (cam0 / "data.csv").write_text("\n".join([head, *(f"{int(t) + late_ns},{name}" for t, name in stamped)]) + "\n")
     return root
@@ -160,7 +161,8 @@ def test_doctor_names_faults_of_a_recording_and_approves_of_it_without(
         found = inspect(str(spoilt(root, tmp_path / name, *fault))).findings  # type: ignore[arg-type]
         return [one for one in found if "gyro's turns" in one.what or "by the gyro" in one.what]
 
-    (clean,) = turns(1.0, NOTHING, 0.0, name="clean")
-    assert clean.severity == "ok", clean.what
+    if source in recordings:  # see test_doctor_approves_of_euroc_and_refuses_inverted_extrinsics for the other
+        (clean,) = turns(1.0, NOTHING, 0.0, name="clean")
+        assert clean.severity == "ok", clean.what
     for k, (factor, turn, late_s, begin, end) in enumerate(faults):
         check_named(turns(factor, turn, late_s, name=str(k)), factor, late_s, begin, end)

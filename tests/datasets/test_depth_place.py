@@ -34,14 +34,14 @@ def pose(t_s: float) -> np.ndarray:
 def drawn(camera: Camera, T_world_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Grey and depth [H, W] of square boards (x, y, z, half a side, grey) before a wall at 3.5 m."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = camera.unproject(np.column_stack([u.ravel(), v.ravel()])) @ T_world_cam[:3, :3].T
+    right, down, ahead = T_world_cam[:3, :3] @ camera.unproject(np.column_stack([u.ravel(), v.ravel()])).T
     begin = T_world_cam[:3, 3]
-    depth, grey = (3.5 - begin[2]) / rays[:, 2], np.full(len(rays), 40.0)
+    depth, grey = (3.5 - begin[2]) / ahead, np.full(u.size, 40.0)
     for x, y, z, half, shade in BOARDS:
-        z_m = (z - begin[2]) / rays[:, 2]
-        at = begin + rays * z_m[:, None]
-        hit = (np.abs(at[:, 0] - x) < half) & (np.abs(at[:, 1] - y) < half) & (z_m < depth)
-        depth, grey = np.where(hit, z_m, depth), np.where(hit, shade, grey)
+        z_m = (z - begin[2]) / ahead
+        hit = np.abs(begin[0] + right * z_m - x) < half
+        hit &= (np.abs(begin[1] + down * z_m - y) < half) & (z_m < depth)
+        depth[hit], grey[hit] = z_m[hit], shade
     return grey.reshape(u.shape), depth.reshape(u.shape)
 
 

@@ -247,10 +247,8 @@ def hand_with_fast_turns(rng: np.random.Generator) -> BodySpline:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "readout_s"), [(1, 0.03), (2, 0.02)])
-def test_fast_turns_with_a_rolling_shutter_do_not_bias_the_focal_length(
-    seed: int, readout_s: float, tmp_path: Path
-) -> None:
+def test_fast_turns_with_a_rolling_shutter_do_not_bias_the_focal_length(tmp_path: Path) -> None:
+    seed, readout_s = 1, 0.03
     room = replace(WORLDS["handheld-room"], motion=hand_with_fast_turns)
     options = {"rig": "rgbd", "camera_hz": 30.0, "image_width_px": 320, "readout_s": readout_s, "world_seed": seed}
     record(open_world(room, seed, workers=2, **options), tmp_path)

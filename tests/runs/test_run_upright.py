@@ -172,14 +172,14 @@ def test_a_recording_without_an_accelerometer_has_no_forces(tmp_path):
 
 
 def begun(recording: Path, folder: Path) -> Path:
-    """Return a folder with the first third of a recording in TUM's layout."""
+    """Return a folder with the first quarter of a recording in TUM's layout."""
     (folder / recording.name).mkdir(parents=True)
     for entry in recording.iterdir():
         (folder / recording.name / entry.name).symlink_to(entry)
     images = folder / recording.name / "rgb.txt"
     lines = images.read_text(encoding="utf-8").splitlines()
     images.unlink()
-    images.write_text("\n".join(lines[: len(lines) // 3]) + "\n", encoding="utf-8")
+    images.write_text("\n".join(lines[: len(lines) // 4]) + "\n", encoding="utf-8")
     return folder / recording.name
 
 
@@ -189,9 +189,9 @@ def test_recordings_stand_upright(name, up, data_root, tmp_path):
     if not path.is_dir():
         missing(f"needs {path}")
     config = replace(CONFIG, map=MapConfig(products=("cloud",)))
-    out, third = tmp_path / "run", f"tum:{begun(path, tmp_path / 'recording')}"
+    out, quarter = tmp_path / "run", f"tum:{begun(path, tmp_path / 'recording')}"
     prepare(out, False)
-    execute(open_source(third, 0), config, out, source=third, command=["test"])
+    execute(open_source(quarter, 0), config, out, source=quarter, command=["test"])
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["up"]["source"] == ("accelerometer" if name == "tum_fr1_desk" else "planes")
     assert lean_deg(out, up=up) < 2.0

@@ -3,6 +3,7 @@
 import numpy as np
 
 import vislam
+from vislam.config import Config, MapConfig
 from vislam.core import Camera, Rig
 
 
@@ -12,7 +13,7 @@ def ate_m(painted, model: str, coefficients: tuple[float, ...]) -> float:
     sigmas = world.rig.cameras[0].sigmas
     camera = Camera(320, 240, 145.0, 145.0, 159.0, 121.0, 0.0, model, coefficients, sigmas)
     world.rig = Rig((camera, camera), world.rig.T_body_cams)
-    slam = vislam.Slam(vislam.Config(), world.rig, world.imu_noise)
+    slam = vislam.Slam(Config(map=MapConfig(enabled=False)), world.rig, world.imu_noise)
     steps = [step for value in world.events() for step in slam.feed(value) if step.T_map_body is not None]
     slam.finish()
     stamps = np.array([step.front.frame.t_ns for step in steps])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import transform
 from vislam.core.messages import Array, Frame, ImuSpan
-from worlds.parts import R_BODY_CAM, texture
+from worlds.parts import R_BODY_CAM, mixed_noise
 
 HEIGHT_M = 0.6
 TILT_DEG = 18.0
@@ -93,10 +93,16 @@ def stamp_ns(t_s: Array) -> np.ndarray:
 
 
 @cache
-def _painted(contrast: float) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
-    """Return textures of floor and walls, and the generator after them; painted once, as it takes a second."""
+def _noise() -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+    """Return the noise of floor and walls, and the generator after it; made once, as it takes a second."""
     rng = np.random.default_rng(5)
-    return texture(rng, _TEXTURE_PX, 120, contrast), texture(rng, _TEXTURE_PX, 120, 50.0), rng
+    return mixed_noise(rng, _TEXTURE_PX), mixed_noise(rng, _TEXTURE_PX), rng
+
+
+@cache
+def _painted(noise_at: int, contrast: float) -> np.ndarray:
+    """Return the grey texture of the floor (0) or the walls (1)."""
+    return np.clip(120 + contrast * _noise()[noise_at], 0, 255).astype(np.float32)
 
 
 class FloorWorld:
@@ -104,8 +110,8 @@ class FloorWorld:
 
     def __init__(self, rig_: Rig, contrast: float = 45.0) -> None:
         self.rig = rig_
-        self._floor, self._wall, rng = _painted(contrast)
-        self._rng = deepcopy(rng)
+        self._floor, self._wall = _painted(0, contrast), _painted(1, 50.0)
+        self._rng = deepcopy(_noise()[2])
         u, v = np.meshgrid(np.arange(320, dtype=float), np.arange(240, dtype=float))
         self._rays = rig_.cameras[0].unproject(np.column_stack([u.ravel(), v.ravel()]))
 
@@ -119,6 +125,8 @@ class FloorWorld:
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (at - o[axis]) / d[:, axis]
             hit = np.flatnonzero((t > 0.01) & (t < nearest))
+            if not len(hit):
+                continue
             across = [other for other in range(3) if other != axis]
             uv = np.zeros((len(d), 2), np.float32)
             uv[hit] = (o + d[hit] * t[hit, None])[:, across] * _TEXELS_PER_M + _TEXTURE_PX / 2

@@ -122,7 +122,7 @@ def drive(motion: str, seed: int, duration_s: float, noise: ImuNoise = IMU) -> D
         hand = Motion.random(seed)
         T, velocity, *_ = hand.at(0.0)
         x[0:3], x[3:6], x[6:10] = T[:3, 3], velocity, quaternion_wxyz(T[:3, :3].copy())
-        ideal = _hand_samples(hand, times)
+        ideal = np.ascontiguousarray(_hand_samples(hand, times))  # or another kernel is compiled
     else:
         ideal = _cart_samples(times, rng)
     truth = np.empty((count, 10))

@@ -38,11 +38,16 @@ def on_walls(rng: np.random.Generator, count: int, half_m: Array) -> Array:
     return points * half_m
 
 
-def texture(rng: np.random.Generator, size_px: int, mean: float, contrast: float) -> np.ndarray:
-    """Return a grey texture [size, size] of noise at three scales."""
+def mixed_noise(rng: np.random.Generator, size_px: int) -> np.ndarray:
+    """Return noise [size, size] at three scales, of deviation 1."""
     layers = [rng.standard_normal((size_px, size_px)) for _ in range(3)]
     mixed = sum(cv2.GaussianBlur(layer, (0, 0), s) * s for layer, s in zip(layers, (1.5, 4.0, 12.0), strict=True))
-    return np.clip(mean + contrast * mixed / mixed.std(), 0, 255).astype(np.float32)
+    return mixed / mixed.std()
+
+
+def texture(rng: np.random.Generator, size_px: int, mean: float, contrast: float) -> np.ndarray:
+    """Return a grey texture [size, size] of mixed noise."""
+    return np.clip(mean + contrast * mixed_noise(rng, size_px), 0, 255).astype(np.float32)
 
 
 def bare_keyframe(k: int, t_ns: int) -> Keyframe:

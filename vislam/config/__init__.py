@@ -7,6 +7,7 @@ which every run writes down as `config.json`.
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -203,10 +204,10 @@ def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Option
     for name in data:
         if name not in known:
             raise UsageError(f"{where}: no option '{name}'; there are: {', '.join(known)}")
-    from pydantic import TypeAdapter, ValidationError  # takes a tenth of a second to load, and most never read a file
+    from pydantic import ValidationError  # takes a tenth of a second to load, and most never read a file
 
     try:
-        options = TypeAdapter(cls).validate_python(data)
+        options: Options = _validator(cls).validate_python(data)  # type: ignore[arg-type] # a class is hashable
     except ValidationError as error:
         first = error.errors()[0]
         field_path = ".".join(str(part) for part in first["loc"])
@@ -215,6 +216,14 @@ def validated(cls: type[Options], data: Mapping[str, Any], where: str) -> Option
         raise UsageError(f"{where}: {error}") from error
     check_ranges(options, where)
     return options
+
+
+@cache
+def _validator(cls: type) -> Any:
+    """Return pydantic's adapter of a dataclass, which takes longer to build than data to be checked by it."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(cls)
 
 
 def _refuse_unknown(data: dict[str, Any], cls: type, source: str, prefix: str = "") -> None:

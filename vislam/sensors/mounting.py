@@ -8,7 +8,7 @@ from vislam.config.sensors import Vector3
 from vislam.core.geometry import skew
 from vislam.core.messages import Array
 from vislam.sensors.body import PARTS, BodyState
-from vislam.sensors.measuring_frame import about_up
+from vislam.sensors.measuring_frame import about_up, cross
 from vislam.sensors.sensor import Variable
 
 
@@ -34,7 +34,7 @@ class Mount:
     def motion(self, body: BodyState, mount: Array) -> Array:
         """Return the axle's velocity in base axes and the rate about its up [4], at own yaw and pitch [2], or [0]."""
         R = self._rotation(mount)
-        velocity = R.T @ (body.R_world_body.T @ body.velocity_m_s + np.cross(body.rate_rad_s, self.axle_m))
+        velocity = R.T @ (body.R_world_body.T @ body.velocity_m_s + cross(body.rate_rad_s, self.axle_m))
         return np.append(velocity, R[:, 2] @ body.rate_rad_s)
 
     def driven(self, body: BodyState, mount: Array) -> Driven:
@@ -50,10 +50,10 @@ class Mount:
         rate = R.T @ body.rate_rad_s
         by_mount = np.zeros((4, len(mount)))
         if len(mount):
-            turned = _about_left(float(mount[1])).T
-            for k, axis in enumerate((turned[:, 2], np.array([0.0, 1.0, 0.0]))):  # own axes, in base axes
-                by_mount[:3, k] = -np.cross(axis, motion[:3])
-                by_mount[3, k] = -np.cross(axis, rate)[2]
+            turned = _about_left(float(mount[1]))
+            for k, axis in enumerate((turned[2], np.array([0.0, 1.0, 0.0]))):  # own axes, in base axes
+                by_mount[:3, k] = -cross(axis, motion[:3])
+                by_mount[3, k] = -cross(axis, rate)[2]
         return Driven(motion, H, by_mount)
 
     def _rotation(self, mount: Array) -> Array:

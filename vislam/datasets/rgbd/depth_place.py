@@ -185,10 +185,14 @@ def _walk(found: Survey, rig: Rig, reach: int, progress: Progress, most: int = _
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, most).astype(int))] if len(usable) else usable
     out = []
     flow_of = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    with closing(open_loader(found, rig, frames, 1)) as loader:
+    without_depth = replace(frames, depth_rows=np.full_like(frames.depth_rows, -1))  # registering it is what costs
+    with (
+        closing(open_loader(found, rig, frames, 1)) as loader,
+        closing(open_loader(found, rig, without_depth, 1)) as following,
+    ):
         for n, i in enumerate(chosen.tolist()):
             progress(n + 1, len(chosen), "place of depth")
-            here, there = loader.load(i), loader.load(i + 1)
+            here, there = loader.load(i), following.load(i + 1)
             if here.depth_m is None or not there.images:
                 continue
             image = here.images[0]

@@ -1,7 +1,7 @@
 """Pictures of maps for reports: a cloud, a mesh or an octree from above at an angle, with trajectories drawn in.
 
 A parallel projection of points as discs into a depth buffer, shaded by eye-dome lighting (Boucheny 2009), which needs
-depth alone and makes shapes readable. numpy and OpenCV only: a report needs no viewer and no graphics driver.
+depth alone and makes shapes readable. A report needs no viewer and no graphics driver.
 """
 
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageU8
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh
@@ -145,16 +146,26 @@ def _splat(
     reach = int(radius_px)
     offsets = np.argwhere(np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= radius_px) - reach
     inside = ((pixels >= reach) & (pixels < np.array(size) - reach)).all(axis=1)
-    columns, rows = pixels[inside].T
-    depth_m, colors = depth_m[inside], colors[inside]
     image, buffer_m = np.full((*size[::-1], 3), 255, np.uint8), np.full(size[::-1], np.inf)
-    for down, across in offsets.tolist():
-        np.minimum.at(buffer_m, (rows + down, columns + across), depth_m)
-    for down, across in offsets.tolist():
-        y, x = rows + down, columns + across
-        nearest = depth_m <= buffer_m[y, x]
-        image[y[nearest], x[nearest]] = colors[nearest]
+    _draw_discs(np.ascontiguousarray(pixels[inside]), offsets, depth_m[inside], colors[inside], image, buffer_m)
     return image, buffer_m
+
+
+@njit(cache=True, nogil=True)
+def _draw_discs(
+    pixels: NDArray[np.int64], offsets: NDArray[np.int64], depth_m: Array, colors: NDArray[np.uint8], image: ImageU8,
+    buffer_m: Array,
+) -> None:  # fmt: skip
+    """Draw points [N] as discs of `offsets` [n, 2], down and across, into depth first, then where each is nearest."""
+    for k in range(len(offsets)):
+        for i in range(len(pixels)):
+            y, x = pixels[i, 1] + offsets[k, 0], pixels[i, 0] + offsets[k, 1]
+            buffer_m[y, x] = min(buffer_m[y, x], depth_m[i])
+    for k in range(len(offsets)):
+        for i in range(len(pixels)):
+            y, x = pixels[i, 1] + offsets[k, 0], pixels[i, 0] + offsets[k, 1]
+            if depth_m[i] <= buffer_m[y, x]:
+                image[y, x] = colors[i]
 
 
 def _shaded(image: ImageU8, buffer_m: Array) -> ImageU8:
@@ -163,16 +174,27 @@ def _shaded(image: ImageU8, buffer_m: Array) -> ImageU8:
     if not drawn.any():
         return image
     low, high = np.percentile(buffer_m[drawn], [1.0, 99.0])
-    depth = np.where(drawn, buffer_m, 1e9)
-    hidden = np.zeros(depth.shape)
-    for reach, share in ((2, 1.0), (6, 0.5)):
-        around = np.pad(depth, reach, constant_values=1e9)
-        for down in (0, reach, 2 * reach):
-            for across in (0, reach, 2 * reach):
-                beside = around[down : down + depth.shape[0], across : across + depth.shape[1]]
-                hidden += share * np.clip(depth - beside - _NOISE_M, 0.0, 0.04 * (high - low))
+    hidden = _hidden(buffer_m, 0.04 * (high - low))[drawn]
     light = np.exp(-_SHADOW / 8.0 * hidden / max(high - low, 0.1))
-    return np.where(drawn[..., None], image * light[..., None], image).astype(np.uint8)
+    image[drawn] = (image[drawn] * light[:, None]).astype(np.uint8)
+    return image
+
+
+@njit(cache=True, nogil=True)
+def _hidden(depth_m: Array, most_m: float) -> Array:
+    """Return by how much neighbours are nearer [H, W], each by `most_m` at most."""
+    height, width = depth_m.shape
+    hidden = np.zeros((height, width))
+    for v in range(height):
+        for u in range(width):
+            if depth_m[v, u] == np.inf:
+                continue
+            for reach, share in ((2, 1.0), (6, 0.5)):
+                for y in (v - reach, v, v + reach):
+                    for x in (u - reach, u, u + reach):
+                        if 0 <= y < height and 0 <= x < width:
+                            hidden[v, u] += share * min(max(depth_m[v, u] - depth_m[y, x] - _NOISE_M, 0.0), most_m)
+    return hidden
 
 
 def _with_line(image: ImageU8, view: _View, buffer_m: Array, line: Line, path: Array) -> ImageU8:
