@@ -379,7 +379,7 @@ def test_stamps_increase_whatever_the_questions_find() -> None:
 
 @pytest.mark.parametrize("kind", ["LSM6DSOX", "MPU-6050", "GY-85"])
 def test_a_host_put_aside_anywhere_blames_no_chip(kind: Any) -> None:
-    for at in (*range(1, 100), *range(100, 300, 7)):  # what comes later is one round of reading after another
+    for at in range(1, 300):
         clock = Stalled(at, (150 if at % 2 else 300) * 1_000_000)
         make = emulated_gy85 if kind == "GY-85" else partial(emulated_board, kind, magnetometer="none")
         with emulated_bus(make(still, clock.now_ns)) as bus:

@@ -4,9 +4,11 @@ import json
 import os
 import shutil
 import signal
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from live_runs import PATIENCE_S, WORLD, Notes, begin, interrupt, settings, stat
 from vislam.cli import run_verb
 from vislam.core.errors import DataError, HardwareError, UsageError
 from vislam.hw.health import Health
+from vislam.live import run_live
 from vislam.live.beginning import in_map, resumed
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
@@ -62,14 +65,17 @@ def test_a_run_ended_by_ctrl_c_and_a_kill_is_resumed_each_time(
     assert after > before
     assert any(Health.IMU_MISSING in health and Health.INVALID in health for health in live.notes.health)
 
-    execute, stop = LiveRun.execute, until(is_found, LiveRun.stop)
+    execute, gone = LiveRun.execute, list[float]()
+    times_out = until(is_found, lambda _: gone.append(PATIENCE_S))  # then its --seconds are over
 
     def till_found(run: LiveRun, show: Callable[[LiveRun], None], seconds: float) -> dict:
-        return execute(run, lambda run: (show(run), stop(run)), seconds)
+        return execute(run, lambda run: (show(run), times_out(run)), seconds)
 
     with monkeypatch.context() as patch:
         patch.setattr(LiveRun, "execute", till_found)
+        patch.setattr(run_live, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + sum(gone)))
         assert run_verb(["live", "--resume", str(out), "--seconds", f"{PATIENCE_S:g}", "--json"]) == 0
+    assert gone == [PATIENCE_S]
     last = json.loads(capsys.readouterr().out)
     assert [resumption["keyframe"] for resumption in last["resumed"]] == [before - 1, after - 1]
     assert last["map"]["keyframes"] == after
