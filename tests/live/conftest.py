@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 from live_runs import PATIENCE_S, begin, has_map, interrupt, left_behind, until
 
-from vislam.live import run_live
+from vislam.core import Recording
+from vislam.live import replay, run_live
+from vislam.live.replayed_imu import InertialTable
 from waiting import HUNG_S
 from worlds.shared import shared
 
@@ -18,6 +20,21 @@ def patient_end() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_live, "_BRIEF_S", HUNG_S)
         patch.setattr(run_live, "_AFTER_FAILURE_S", HUNG_S)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def read_once() -> Iterator[None]:
+    """Read the samples of a recording once: ten minutes of them are half a second of CPU, and each run needs them."""
+    tables, read = {}, vars(replay)["_inertial_table"]
+
+    def kept(recording: Recording, uri: str, rate_hz: float) -> InertialTable:
+        if (uri, rate_hz) not in tables:
+            tables[uri, rate_hz] = read(recording, uri, rate_hz)
+        return tables[uri, rate_hz]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay, "_inertial_table", kept)
         yield
 
 

@@ -4,8 +4,11 @@ import json
 import os
 import shutil
 import signal
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from live_runs import PATIENCE_S, WORLD, Notes, begin, interrupt, settings, stat
 from vislam.cli import run_verb
 from vislam.core.errors import DataError, HardwareError, UsageError
 from vislam.hw.health import Health
+from vislam.live import run_live
 from vislam.live.beginning import in_map, resumed
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
@@ -41,7 +45,10 @@ def is_placed(run: LiveRun) -> bool:
     return Health.NOT_IN_MAP not in Health(status(run).get("health", Health.NOT_IN_MAP))
 
 
-def test_a_run_ended_by_ctrl_c_and_a_kill_is_resumed_each_time(interrupted, tmp_path: Path) -> None:
+def test_a_run_ended_by_ctrl_c_and_a_kill_is_resumed_each_time(
+    interrupted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At last by the command line, which also says what it cannot go on from."""
     first, metrics = interrupted
     out = shutil.copytree(first, tmp_path / "run")
     before = keyframes_in(out)
@@ -58,7 +65,18 @@ def test_a_run_ended_by_ctrl_c_and_a_kill_is_resumed_each_time(interrupted, tmp_
     assert after > before
     assert any(Health.IMU_MISSING in health and Health.INVALID in health for health in live.notes.health)
 
-    last = begin(out).execute(until(is_found, interrupt), PATIENCE_S)
+    execute, gone = LiveRun.execute, list[float]()
+    times_out = until(is_found, lambda _: gone.append(PATIENCE_S))  # then its --seconds are over
+
+    def till_found(run: LiveRun, show: Callable[[LiveRun], None], seconds: float) -> dict:
+        return execute(run, lambda run: (show(run), times_out(run)), seconds)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LiveRun, "execute", till_found)
+        patch.setattr(run_live, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + sum(gone)))
+        assert run_verb(["live", "--resume", str(out), "--seconds", f"{PATIENCE_S:g}", "--json"]) == 0
+    assert gone == [PATIENCE_S]
+    last = json.loads(capsys.readouterr().out)
     assert [resumption["keyframe"] for resumption in last["resumed"]] == [before - 1, after - 1]
     assert last["map"]["keyframes"] == after
     assert last["map"]["found_t_s"] > 0.0
@@ -70,6 +88,21 @@ def test_a_run_ended_by_ctrl_c_and_a_kill_is_resumed_each_time(interrupted, tmp_
         assert len(stored.frames()) == last["frames"]
     finally:
         stored.close()
+
+    for arguments, code, message in [
+        (["--resume", str(tmp_path / "none")], 2, "holds no run to resume"),
+        (["--out", str(tmp_path / "new"), "--localize-only"], 2, "give --map"),
+        (["--out", str(out), "--map", str(out), "--source", f"replay:{WORLD}", "--overwrite"], 2, "would be replaced"),
+        (["--out", str(tmp_path / "new"), "--map", str(out)], 2, "other cameras"),
+    ]:
+        assert run_verb(["live", *arguments]) == code
+        error = capsys.readouterr().err.strip()
+        assert message in error
+        assert len(error.splitlines()) == 1
+    assert run_verb(["run", "--resume", str(out)]) == 2
+    assert f"vislam live --resume {out}" in capsys.readouterr().err
+    assert (out / "session.db").is_file()
+    assert not (tmp_path / "new").exists()
 
 
 def test_frames_whose_keyframes_waited_at_the_end_are_not_lost(tmp_path: Path) -> None:
@@ -118,26 +151,6 @@ def test_what_cannot_go_on_is_refused_before_anything_starts(interrupted, tmp_pa
     with pytest.raises(UsageError, match="the machine was restarted"):
         resumed(out, ReplaySource(WORLD), settings())
     assert resumed(tmp_path, ReplaySource(WORLD), settings()) is None
-
-
-def test_the_command_line_goes_on_and_says_what_it_cannot(interrupted, tmp_path: Path, capsys) -> None:
-    out = shutil.copytree(interrupted[0], tmp_path / "run")
-    assert run_verb(["live", "--resume", str(out), "--seconds", "4", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["resumed"]) == 1
-    for arguments, code, message in [
-        (["--resume", str(tmp_path / "none")], 2, "holds no run to resume"),
-        (["--out", str(tmp_path / "new"), "--localize-only"], 2, "give --map"),
-        (["--out", str(out), "--map", str(out), "--source", f"replay:{WORLD}", "--overwrite"], 2, "would be replaced"),
-        (["--out", str(tmp_path / "new"), "--map", str(out)], 2, "other cameras"),
-    ]:
-        assert run_verb(["live", *arguments]) == code
-        error = capsys.readouterr().err.strip()
-        assert message in error
-        assert len(error.splitlines()) == 1
-    assert run_verb(["run", "--resume", str(out)]) == 2
-    assert f"vislam live --resume {out}" in capsys.readouterr().err
-    assert (out / "session.db").is_file()
-    assert not (tmp_path / "new").exists()
 
 
 def test_the_advice_after_an_interrupt_works_whether_or_not_something_was_recorded(

@@ -28,23 +28,38 @@ from vislam.runs.session import Session
 from waiting import HUNG_S
 
 
-def start(
-    tmp_path: Path, name: str, outages: Outages | None = None, world: str = WORLD, **others: object
-) -> tuple[LiveRun, Path]:
+def start(tmp_path: Path, name: str, source: type[ReplaySource] = ReplaySource) -> tuple[LiveRun, Path]:
     out = tmp_path / name
     prepare(out, overwrite=False)
-    source = ReplaySource(world, outages=outages)
-    return LiveRun(source, settings(name, **others), out, world, ["vislam", "live"]), out
+    return LiveRun(source(WORLD), settings(name), out, WORLD, ["vislam", "live"]), out
+
+
+def lingering(open_source: Callable[[], InertialSource]) -> InertialSource:
+    """Open a source in a process that will not leave, as one whose library waits for a thread of its own."""
+    atexit.register(time.sleep, HUNG_S)
+    return open_source()
+
+
+class Lingering(ReplaySource):
+    def inertial(self) -> Callable[[], InertialSource]:
+        return partial(lingering, super().inertial())
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list[Health]]:
-    """A run to its end in which the IMU and then the camera are unplugged, and the health that was seen on the way."""
-    outages = Outages(imu=((8.0, 9.0),), camera=((11.0, 13.0),))
-    live, out = start(tmp_path_factory.mktemp("live"), "whole", outages, WORLD, dense=True)
+    """A run to its end in which the IMU and then the camera are unplugged, and the health that was seen on the way.
+
+    Its fast process does not leave by itself.
+    """
+    out = tmp_path_factory.mktemp("live") / "whole"
+    prepare(out, overwrite=False)
+    source = Lingering(WORLD, outages=Outages(imu=((8.0, 9.0),), camera=((11.0, 13.0),)))
+    live = LiveRun(source, settings("whole", dense=True), out, WORLD, ["vislam", "live"])
     live.notes = Notes()
     lasted_16_s = until(lambda run: status(run).get("samples", 0) > 3000 and has_map(run), LiveRun.stop)
-    metrics = live.execute(lasted_16_s, PATIENCE_S)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_live, "_TAKING_APART_S", 0.1)
+        metrics = live.execute(lasted_16_s, PATIENCE_S)
     assert left_behind("whole") == []
     return out, metrics, live.notes.health
 
@@ -141,29 +156,6 @@ def test_what_a_process_raises_comes_home_whole(tmp_path: Path) -> None:
     assert left_behind("mono") == []
 
 
-def lingering(open_source: Callable[[], InertialSource]) -> InertialSource:
-    """Open a source in a process that will not leave, as one whose library waits for a thread of its own."""
-    atexit.register(time.sleep, HUNG_S)
-    return open_source()
-
-
-class Lingering(ReplaySource):
-    def inertial(self) -> Callable[[], InertialSource]:
-        return partial(lingering, super().inertial())
-
-
-def test_a_process_that_has_written_all_and_does_not_leave_is_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run_live, "_TAKING_APART_S", 0.1)
-    out = tmp_path / "lingering"
-    prepare(out, overwrite=False)
-    live = LiveRun(Lingering(WORLD), settings("lingering"), out, WORLD, ["vislam", "live"])
-    metrics = live.execute(until(has_map, LiveRun.stop), PATIENCE_S)
-    assert metrics["frames"] == json.loads((out / "metrics.json").read_text())["frames"] > 0
-    assert left_behind("lingering") == []
-
-
 def no_board() -> InertialSource:
     raise BusError("/dev/i2c-7: it cannot be opened", OSError(errno.ENOENT, "No such file or directory"))
 
@@ -176,9 +168,7 @@ class Boardless(ReplaySource):
 
 
 def test_a_sensor_that_is_missing_ends_the_run_before_it_began_and_the_next_try_is_not_refused(tmp_path: Path) -> None:
-    out = tmp_path / "boardless"
-    prepare(out, overwrite=False)
-    live = LiveRun(Boardless(WORLD), settings("boardless"), out, WORLD, ["vislam", "live"])
+    live, out = start(tmp_path, "boardless", Boardless)
     with log_to(out, ["vislam", "live"]), pytest.raises(BusError, match="it cannot be opened") as caught:
         live.execute()
     assert caught.value.exit_code == HardwareError.exit_code and caught.value.kind == "gone"

@@ -7,9 +7,10 @@ import pytest
 
 from vislam.config import load
 from vislam.core.jit import njit
-from vislam.live import map_rehearsal, rehearsal
+from vislam.live import map_rehearsal
 from vislam.live.map_rehearsal import rehearse_map
 from vislam.live.processes.child import Flag, Life, Signals, measured
+from vislam.live.rehearsal import rehearse
 from vislam.live.virtual.cart import NOISE
 from vislam.live.virtual.place import PlaceOptions, virtual_rig
 from vislam.pipeline.settings import derived
@@ -26,8 +27,8 @@ def test_loops_are_rehearsed(monkeypatch, rig, settings):
         slams.append(Slam(*arguments))
         return slams[0]
 
-    monkeypatch.setattr(rehearsal, "Slam", slam)
-    rehearsal.rehearse(load(None, settings), virtual_rig(PlaceOptions(rig=rig)), NOISE)
+    monkeypatch.setattr("vislam.slam.Slam", slam)
+    rehearse(load(None, settings), virtual_rig(PlaceOptions(rig=rig)), NOISE)
     found = slams[0].back.counters["loop"]
     print(found)
     assert found["accepted"] > 0

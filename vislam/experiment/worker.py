@@ -3,6 +3,7 @@
 Standard input is a pipe that nothing is written to: when it closes, the parent is gone, and the worker ends.
 """
 
+import gc
 import json
 import os
 import sys
@@ -94,6 +95,7 @@ def main() -> None:
     request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
     threading.Thread(target=_exit_when_orphaned, daemon=True).start()
     write_json(folder / "result.json", run_job(request["spec"], folder, Path(request["cache"])))
+    gc.freeze()  # the end of the process looks for garbage among all that is not frozen
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
 from vislam.core.recording import Recording
-from vislam.runs import check_fits, imu_noise, map_of
 from vislam.runs.folder import MapChoice
 from vislam.runs.session import Session, has_begun, recall
 
@@ -28,6 +27,8 @@ class Beginning:
 
 def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
     """Return the beginning in a map; raises UsageError when the sensors cannot go on in it, DataError without one."""
+    from vislam.runs import imu_noise, map_of  # whole runs, which the processes that get a beginning need not load
+
     stored = Session(base.session)
     try:
         noise = imu_noise(config.imu, recording.imu_noise)
@@ -42,6 +43,8 @@ def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None
     Raises UsageError when its sensors are others now or none of them recognises a place, or the machine was restarted,
     DataError when its session is damaged.
     """
+    from vislam.runs import check_fits, imu_noise
+
     path = out / "session.db"
     if not has_begun(path):
         return None

@@ -14,7 +14,6 @@ from vislam.core.messages import Frame, ImuSample
 from vislam.imu import ImuNoise
 from vislam.live.processes.fast import warm_up
 from vislam.pipeline.front import Front
-from vislam.slam import Slam
 from vislam.vision.two_view import epipolar_distances, refine_two_view
 
 _RESTING_FRAMES = 18  # enough for a first state
@@ -27,12 +26,14 @@ _POINTS = 40
 _SAMPLES = 5  # per frame
 _SPEED_M_S, _SWAY_RAD_S = 0.8, 3.0
 _DEPTH_M = 2.0
+_WIDTH_PX = 320  # of images, at most: the same kernels, in half of the time
 _NOBODYS = Camera(8, 8, 8.0, 8.0, 4.0, 4.0)  # without one, frames have no image
 
 
 def rehearse_front(config: Config, rig: Rig, noise: ImuNoise) -> None:
     """Run the front half once, and its filter through a longer rest."""
     warm_up(config, noise, rig.T_body_cam0)
+    rig = _small(rig)
     _see_direction()
     front = Front(_patient(config), rig, noise, StageClock())
     for value in made_up(config, rig):
@@ -47,10 +48,13 @@ def rehearse(config: Config, rig: Rig, noise: ImuNoise) -> None:
 
     The window is small, so that keyframes leave it. What is seldom called is called by itself.
     """
+    from vislam.slam import Slam  # brings gtsam, which the front process need not load
+
     loop = replace(
         config.loop, odometry_skip_keyframes=0, appearance_skip_keyframes=0, appearance_skip_s=0.0, min_inliers=6,
         first_training=2, min_training_lag=1,
     )  # fmt: skip
+    rig = _small(rig)
     window = replace(config.window, keyframes=min(config.window.keyframes, _WINDOW))
     config = replace(_patient(config), loop=loop, window=window, map=replace(config.map, enabled=False))
     slam = Slam(config, rig, noise)
@@ -59,6 +63,11 @@ def rehearse(config: Config, rig: Rig, noise: ImuNoise) -> None:
         slam.feed(value)
     slam.finish()
     _see_direction()
+
+
+def _small(rig: Rig) -> Rig:
+    """Return the rig with small images."""
+    return replace(rig, cameras=tuple(camera.scaled(min(1.0, _WIDTH_PX / camera.width)) for camera in rig.cameras))
 
 
 def _patient(config: Config) -> Config:

@@ -20,9 +20,7 @@ from vislam.core.messages import (
     LoopCandidate,
     LoopEdge,
     NavState,
-    Tracking,
 )
-from vislam.frontend import knows_scale, mode_for
 from vislam.graph import PoseGraph
 from vislam.loop import FalseLoops, LoopCloser, as_candidate
 from vislam.mapping.depth.mono import SeenFrame
@@ -31,8 +29,8 @@ from vislam.mapping.semantic.images import Labeller
 from vislam.mapping.stage import MapStage
 from vislam.pipeline.depth_in_map import DepthInMap
 from vislam.pipeline.front import Front
-from vislam.pipeline.settings import without_gravity
-from vislam.pipeline.steps import FrontStep, KeyframeStep
+from vislam.pipeline.settings import makes_depth, without_gravity
+from vislam.pipeline.steps import FrontStep, KeyframeStep, seen_between
 from vislam.sensors import Suite
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
@@ -259,18 +257,3 @@ class KeyframeIntake:
 def map_stage(config: Config, rig: Rig, clock: StageClock, labeller: Labeller | None = None) -> MapStage | None:
     """Return the map of a pipeline; None where it is off."""
     return MapStage(config.map, rig, makes_depth(config, rig), clock, labeller) if config.map.enabled else None
-
-
-def makes_depth(config: Config, rig: Rig) -> bool:
-    """Whether the map takes depth from one moving camera."""
-    return config.map.enabled and config.map.mono_depth.enabled and not knows_scale(mode_for(config.frontend, rig))
-
-
-def seen_between(front: FrontStep) -> list[SeenFrame]:
-    """Return what depth from one camera can use of a step: a frame between keyframes of which odometry knows where."""
-    frame, T = front.frame, front.T_keyframe_body
-    is_known = T is not None and front.track.vo.tracking is not Tracking.LOST
-    if front.track.keyframe is not None or not is_known or not frame.images:
-        return []
-    assert T is not None
-    return [SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T)]

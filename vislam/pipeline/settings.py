@@ -103,3 +103,8 @@ def _filter(config: Config, mode: str, errors: CommonErrors, has_further: bool) 
         scale_sigma=max(config.ekf.scale_sigma, errors.scale_sigma),
         vo_inflation=config.ekf.vo_inflation if errors.vo_inflation is None else errors.vo_inflation,
     )
+
+
+def makes_depth(config: Config, rig: Rig) -> bool:
+    """Whether the map takes depth from one moving camera."""
+    return config.map.enabled and config.map.mono_depth.enabled and not knows_scale(mode_for(config.frontend, rig))

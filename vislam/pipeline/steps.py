@@ -12,9 +12,11 @@ from vislam.core.messages import (
     LoopEdge,
     NavState,
     RetrievedKeyframe,
+    Tracking,
 )
 from vislam.ekf import Correction
 from vislam.frontend import TrackResult
+from vislam.mapping.depth.mono import SeenFrame
 from vislam.trajectory.continuity import Continuity
 from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 
@@ -87,3 +89,13 @@ class Finish:
     keyframes: list[KeyframeStep]  # those that had waited for gravity until the end
     update: GraphUpdate | None  # None: not one keyframe reached the back end
     record: GraphRecord | None
+
+
+def seen_between(front: FrontStep) -> list[SeenFrame]:
+    """Return what depth from one camera can use of a step: a frame between keyframes of which odometry knows where."""
+    frame, T = front.frame, front.T_keyframe_body
+    is_known = T is not None and front.track.vo.tracking is not Tracking.LOST
+    if front.track.keyframe is not None or not is_known or not frame.images:
+        return []
+    assert T is not None
+    return [SeenFrame(frame.t_ns, frame.images[0], front.keyframe_id, T)]

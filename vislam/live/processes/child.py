@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import logging
 import os
 import pickle
@@ -137,6 +138,23 @@ class Life:
             self._is_orphan = True
 
 
+class _Uncollected:
+    """Is unpickled before the body, whose modules make 200,000 objects: the collector finds nothing among them."""
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        return gc.disable, ()
+
+
+def _arrived(_: None, *arguments: Any) -> None:
+    """Run `guarded` where all is imported, which lives as long as the process."""
+    gc.freeze()
+    gc.enable()
+    try:
+        guarded(*arguments)
+    finally:
+        gc.freeze()  # the end of the process looks for garbage among all that is not frozen
+
+
 def guarded(
     role: str, report: Connection, signals: Signals, body: Callable[[Life], None], log_level: str = "info"
 ) -> None:
@@ -169,7 +187,7 @@ class Child:
         context = get_context("spawn")
         report, sender = context.Pipe(duplex=False)
         process = context.Process(
-            target=guarded, args=(role, sender, signals, body, log.level()), name=f"vislam {role}"
+            target=_arrived, args=(_Uncollected(), role, sender, signals, body, log.level()), name=f"vislam {role}"
         )
         before = signal.pthread_sigmask(signal.SIG_BLOCK, interrupts.SIGNALS)
         try:

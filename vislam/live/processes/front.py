@@ -33,11 +33,11 @@ from vislam.live.web.updates import FrameUpdate
 from vislam.live.wire.mail import Outbox
 from vislam.live.wire.publisher import PoseReader
 from vislam.live.wire.stream import SampleReceiver, Value
-from vislam.pipeline.back import makes_depth, seen_between
 from vislam.pipeline.dark import SilentCamera
 from vislam.pipeline.front import Front
 from vislam.pipeline.front_report import FrontReport
-from vislam.pipeline.steps import FrontStep
+from vislam.pipeline.settings import makes_depth
+from vislam.pipeline.steps import FrontStep, seen_between
 from vislam.runs.evidence import front_evidence
 from vislam.runs.verdict import Trust, Verdict, judge
 from vislam.sensors import Suite

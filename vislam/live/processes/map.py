@@ -32,10 +32,10 @@ from vislam.live.wire.mail import Inbox, Outbox
 from vislam.mapping.depth.mono import SeenFrame
 from vislam.mapping.mapper import Mapper
 from vislam.mapping.stage import MapStage
-from vislam.pipeline.back import MAX_SEEN, map_stage, seen_between
+from vislam.pipeline.back import MAX_SEEN, map_stage
 from vislam.pipeline.front_report import FrontReport
 from vislam.pipeline.in_map import Place
-from vislam.pipeline.steps import Finish, KeyframeStep, Step
+from vislam.pipeline.steps import Finish, KeyframeStep, Step, seen_between
 from vislam.runs import Run, begun
 from vislam.runs.folder import MapChoice
 from vislam.runs.session import Session, SessionWriter
