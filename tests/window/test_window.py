@@ -12,8 +12,7 @@ from vislam.config import WindowConfig
 from vislam.core.camera import EXACT, CameraSigmas, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert, se3_log
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
-from vislam.frontend.result import lost_motion
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations, Tracking
 from vislam.window import SlidingWindow, WindowUpdate, gate
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
 from worlds.parts import MACHINE, with_slips
@@ -271,7 +270,7 @@ def test_a_body_that_vision_lost_among_holes_has_a_speed_that_bodies_have() -> N
     for k in range(19, len(packets)):
         p, ends = packets[k], packets[k].imu
         ends = ImuSpan(ends.t_ns[[0, -1]], ends.gyro_rad_s[[0, -1]], ends.accel_m_s2[[0, -1]])
-        packets[k] = replace(p, imu=ends, observations=nothing, vo=lost_motion(p.keyframe.t_ns, k - 1, True))
+        packets[k] = replace(p, imu=ends, observations=nothing, vo=replace(p.vo, tracking=Tracking.LOST))
     newest = [window.add(p) for p in packets][-1].newest
     assert np.linalg.norm(newest.velocity_world_m_s) < 6.0
     assert np.sqrt(np.diag(newest.covariance)[6:9].max()) < 3.1
