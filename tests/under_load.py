@@ -33,6 +33,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of which process stops when and for how long")
     parser.add_argument("tests", nargs="+", help="arguments of pytest, after --")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(given.busy)]
     tests = subprocess.Popen([sys.executable, "-m", "pytest", "-q", *given.tests])
     rng = random.Random(given.seed)
@@ -49,7 +50,11 @@ def main() -> int:
     finally:
         for loop in loops:
             loop.kill()
-        tests.terminate()
+        if tests.poll() is None:
+            for one in [tests.pid, *descendants(tests.pid)]:
+                with contextlib.suppress(OSError):
+                    os.kill(one, signal.SIGTERM)
+                    os.kill(one, signal.SIGCONT)
     return tests.wait()
 
 

@@ -55,7 +55,7 @@ class Cart:
                     self.fast.add(value)
                 self.fast.publish(self._clock.now_ns(), self._driver.health)
             power_up(self.fast, self._driver)
-            self.refusals.append(self.fast.power_up_report().get("refused", ""))
+            self.refusals.append(self.fast.alone.report().get("refused", ""))
         return self.poses[-1]
 
 
@@ -77,7 +77,7 @@ def test_a_cart_that_stands_has_an_attitude_before_vision_and_says_what_it_lacks
         assert pose.health == BEFORE_VISION | Health.MAG_OK
         np.testing.assert_allclose(pose.T_odom_base[2, :3], np.array(SLOPE) / np.linalg.norm(SLOPE), atol=0.01)
         np.testing.assert_allclose(pose.rate_rad_s, 0.0, atol=0.03)
-        told = it.fast.power_up_report()
+        told = it.fast.alone.report()
         np.testing.assert_allclose(told["gyro_bias_rad_s"], bias_of(bus, 30.0), atol=2e-3)
         assert told["temperature_c"] == pytest.approx(30.0, abs=0.2)
         known = np.isfinite(np.diag(unpack(pack(pose)).pose_covariance))

@@ -1,5 +1,6 @@
 """The kernels against numbers: derivatives by differences, factorisation and covariance against numpy."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ def make_scene(rig, seed: int) -> Scene:
         tracks.add(packet.keyframe.id, packet.observations)
         if packet.imu is not None:
             told = [told_way(truths[1][0], truths[2][0], 0.01, 1.0, 0.02, rng)] if len(X) == 3 else []
-            links.push(packet.imu, 0.2, X[-2][15:] + 1e-3, np.eye(4), len(X) == 3, told)
+            links.push(replace(packet, at_rest=len(X) == 3), 0.2, X[-2][15:] + 1e-3, np.eye(4), told)
     count = len(X)
     links.hear(np.array(X), np.zeros(count, dtype=np.bool_))
     camera = Camera(

@@ -12,7 +12,7 @@ from vislam.config import WindowConfig
 from vislam.core.camera import EXACT, CameraSigmas, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert, se3_log
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations, Tracking
 from vislam.window import SlidingWindow, WindowUpdate, gate
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
 from worlds.parts import MACHINE, with_slips
@@ -260,6 +260,20 @@ def test_inertial_data_bridges_lost_vision_and_vision_bridges_lost_inertial_data
     assert position_rmse(updates, truths) < 0.01 * path_m(truths)
     sigma = [float(np.sqrt(np.trace(u.newest.covariance[6:9, 6:9]))) for u in updates]
     assert sigma[21] > 1.5 * sigma[17]  # without vision, velocity is known less well
+
+
+def test_a_body_that_vision_lost_among_holes_has_a_speed_that_bodies_have() -> None:
+    packets, truths = World(Motion.random(8), STEREO, 8, duration_s=12.0, tracks=60).packets()
+    window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, MACHINE)
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(8)))
+    nothing = Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    for k in range(19, len(packets)):
+        p, ends = packets[k], packets[k].imu
+        ends = ImuSpan(ends.t_ns[[0, -1]], ends.gyro_rad_s[[0, -1]], ends.accel_m_s2[[0, -1]])
+        packets[k] = replace(p, imu=ends, observations=nothing, vo=replace(p.vo, tracking=Tracking.LOST))
+    newest = [window.add(p) for p in packets][-1].newest
+    assert np.linalg.norm(newest.velocity_world_m_s) < 6.0
+    assert np.sqrt(np.diag(newest.covariance)[6:9].max()) < 3.1
 
 
 @pytest.mark.parametrize("rig", [MONO, STEREO], ids=["mono", "stereo"])

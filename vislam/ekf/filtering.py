@@ -71,11 +71,11 @@ class Filtering:
         self._since_ns = state.t_ns
         self.ekf.initialise(state, vo)
 
-    def tear(self, vo: VoMeasurement, T_odom_body: Array | None = None) -> None:
+    def tear(self, vo: VoMeasurement, T_odom_body: Array | None = None, known_m2: Array | None = None) -> None:
         """Give up what is known of the motion: before the frame of `vo`, which is lost, an unknown time has passed.
 
-        The pose in `odom` stays, as nothing is known that would move it; or it is `T_odom_body` [4, 4], of a body that
-        may have any velocity now.
+        The pose in `odom` stays, as nothing is known that would move it; or it is `T_odom_body` [4, 4], its place known
+        to `known_m2` [3, 3] when it was last seen, of a body that may have any velocity now.
         """
         state = self.ekf.state_at(vo.t_ns)
         if state is None:
@@ -84,6 +84,7 @@ class Filtering:
         if T_odom_body is not None:  # predicted through a hole, the covariance ties tilt and velocity by nothing real
             R, sigmas = T_odom_body[:3, :3], np.array([_LEVEL_RAD, _LEVEL_RAD, _TORN[0]])
             turn, motion = R.T @ np.diag(sigmas**2) @ R, np.diag(np.repeat(_TORN[1:3], 3) ** 2)
+            motion[:3, :3] += 0.0 if known_m2 is None else known_m2
             covariance = block_diag(turn, motion, state.covariance[9:, 9:])
             state = replace(state, T_world_body=T_odom_body, velocity_world_m_s=np.zeros(3))
         self._torn_to = replace(state, covariance=covariance)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from vislam.core.messages import no_observations
 from vislam.frontend.start import Initialisation
-from vislam.live.notices import Rebase, Start, ToFast
+from vislam.live.notices import GaveUp, Rebase, Start, ToFast
 from vislam.pipeline.front import Front
 from vislam.pipeline.steps import FrontStep
 
@@ -24,6 +24,9 @@ class Corrections:
         if found is not self._start and found is not None and found.last is not None:
             self._start = found
             yield Start(found.last, step.track.vo)
+        if found is None and self._start is not None:
+            self._start = None
+            yield GaveUp()
         inertial = self._front.inertial
         torn_to = None if inertial is None else inertial.filtering.take_torn()
         if not self._is_tight:

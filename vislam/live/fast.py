@@ -19,7 +19,7 @@ from vislam.ekf.loose.filter import Ekf
 from vislam.hw.health import Health
 from vislam.imu import BiasMemory, ImuBuffer, ImuNoise, PowerUp, RestDetector, is_slow
 from vislam.live.inertial_only import InertialOnly
-from vislam.live.notices import CameraHealth, Doubted, MapMoved, Rebase, Start, ToFast
+from vislam.live.notices import CameraHealth, Doubted, GaveUp, MapMoved, Rebase, Start, ToFast
 from vislam.live.wire.published_pose import PublishedPose, of_base
 from vislam.sensors import Suite
 from vislam.trajectory.continuity import Continuity, in_odom
@@ -34,7 +34,7 @@ BaseState = tuple[Array, Array, Array, Array, Array]  # pose, velocity, rate, co
 
 
 class FastPath:
-    """Owns the filter that is published. One thread; no clock: the caller passes the time."""
+    """Owns the filter that is published. One thread; no clock: the caller passes the time. `alone`: without vision."""
 
     def __init__(
         self, config: Config, noise: ImuNoise, T_body_camera: Array, publish: Callable[[PublishedPose], None],
@@ -58,7 +58,7 @@ class FastPath:
         self._ekf = Ekf(config.ekf, noise, config.machine, T_body_camera, suite)
         self._buffer = ImuBuffer(config.imu, config.machine)
         self._is_mag_calibrated = is_mag_calibrated
-        self._alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
+        self.alone = InertialOnly(config, noise, BiasMemory(config.power_up.remembered) if memory is None else memory)
         self._rest = RestDetector(config.init, noise)
         self._rest_t_ns: int | None = None  # until when rest was looked for
         self._gyro = np.zeros(3)
@@ -103,7 +103,7 @@ class FastPath:
         """Take a sample; return what the filter of the front process needs besides."""
         if isinstance(value, MagSample):
             if self._is_mag_calibrated:
-                self._alone.add_field(value)
+                self.alone.add_field(value)
             return None
         self.counters["samples"] += 1
         if not self._buffer.add(value):
@@ -111,7 +111,7 @@ class FastPath:
         self._ekf.predict(value)
         self._gyro = value.gyro_rad_s
         if not self._started:
-            self._alone.add(value)
+            self.alone.add(value)
         return None if self._is_blind else self._look_for_rest(value.t_ns)
 
     def power_up(self, temperature_c: float | None) -> PowerUp | None:
@@ -119,22 +119,13 @@ class FastPath:
 
         With vision already there only while the body rests. Called twice a second: it takes a third of a millisecond.
         """
-        return self._alone.look(self._buffer, temperature_c) if not self._started or self._at_rest else None
+        return self.alone.look(self._buffer, temperature_c) if not self._started or self._at_rest else None
 
     @property
     def _uncorrected_s(self) -> float:
         """Seconds since vision, or without a camera a further sensor, corrected the filter."""
         since_heard_ns = (self._buffer.newest_t_ns or 0) - self._heard_ns
         return since_heard_ns / _NS if self._is_blind else self._ekf.dead_reckoning_s
-
-    @property
-    def bias_per_c(self) -> Array:
-        """What is remembered of the gyro's drift [3], rad/s per deg C."""
-        return self._alone.bias_per_c
-
-    def power_up_report(self) -> dict[str, Any]:
-        """Return the zero that was found, or why none was."""
-        return self._alone.report()
 
     def correct(self, message: ToFast) -> None:
         """Take what vision, camera or graph say, late as it may be."""
@@ -167,6 +158,8 @@ class FastPath:
                 self._map = message
         elif isinstance(message, CameraHealth | Doubted):
             self._said[type(message)] = message.health
+        elif isinstance(message, GaveUp):
+            self._started, self._resets = 0, self._resets + 1
         else:
             self._start(message)
 
@@ -190,9 +183,9 @@ class FastPath:
         resets, T_map_odom = self._resets + self._ekf.counters["soft_resets"], self._map.T_map_odom
         if state is None:
             base = np.eye(4), np.zeros(3), np.zeros(3), _UNKNOWN, _UNKNOWN
-            if self._alone.has_attitude:
-                base = self._alone.base(self._gyro)
-            resets, newest_ns = 0, self._buffer.newest_t_ns or 0
+            if self.alone.has_attitude:
+                base = self.alone.base(self._gyro)
+            newest_ns = self._buffer.newest_t_ns or 0
         else:
             variance = self._noise.gyroscope_noise_density**2 * self._noise.rate_hz
             base, newest_ns = of_base(state, self._gyro, variance, self._offset), state.t_ns
@@ -228,10 +221,10 @@ class FastPath:
             health |= event
         if age_ns > _IMU_TIMEOUT_S * _NS:
             health |= Health.IMU_MISSING | Health.INVALID
-        if self._alone.is_field_good(now_ns):
+        if self.alone.is_field_good(now_ns):
             health |= Health.MAG_OK
         if state is None:
-            knows_up = Health.LEVELLED | Health.DEAD_RECKONING if self._alone.has_attitude else Health(0)
+            knows_up = Health.LEVELLED | Health.DEAD_RECKONING if self.alone.has_attitude else Health(0)
             return health | knows_up | Health.INVALID
         health |= Health.LEVELLED
         sees = (self._sees or self._is_blind) and self._uncorrected_s <= config.vision_timeout_s
@@ -240,25 +233,32 @@ class FastPath:
             health |= Health.AT_REST
         if self._rejects:
             health |= Health.GATE_REJECT
-        drifted = self._ekf.position_variance_m2 - self._settled_variance
         velocity_variance = np.trace(state.covariance[6:9, 6:9])
-        if drifted > config.drift_sigma_m**2 or velocity_variance > config.velocity_sigma_m_s**2:
+        if self._drifted_far or velocity_variance > config.velocity_sigma_m_s**2:
             health |= Health.INVALID
         return health
+
+    @property
+    def _drifted_far(self) -> bool:
+        """Whether the position lost more certainty than `live.drift_sigma_m` since vision last corrected it."""
+        drifted = self._ekf.position_variance_m2 - self._settled_variance
+        return drifted > self._config.live.drift_sigma_m**2
 
     def _start(self, start: Start) -> None:
         """Begin at the first state, and catch up with the newest sample."""
         self._ekf.initialise(start.state, start.vo)
         self._in_odom.clear()
         self._in_map.clear()
-        self._resets += self._started > 0 or self._alone.has_attitude
+        self._resets += self._started > 0 or self.alone.has_attitude
         self._started += 1
-        self._alone.end()
-        self._follow_vision(True, True, False)
+        self.alone.end()
+        self._follow_vision(True, False, False)
+        self._settled_variance = float(np.trace(start.state.covariance[3:6, 3:6]))
 
     def _follow_vision(self, sees: bool, accepted: bool, rejects: bool) -> None:
         self._sees, self._rejects = sees, rejects
         if accepted and self._ekf.initialised:
+            self._resets += self._drifted_far
             self._settled_variance = self._ekf.position_variance_m2
 
     def _look_for_rest(self, t_ns: int) -> Hint | None:

@@ -18,6 +18,11 @@ class Start:
     vo: VoMeasurement
 
 
+@dataclass(frozen=True, slots=True)
+class GaveUp:
+    """Gravity was not found in time: vision goes on alone, and nothing corrects a filter any more."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Rebase:
     """The state that a tight filter has after a frame; too much work for the fast process itself."""
@@ -67,4 +72,4 @@ class MapCells:
     body_m: tuple[float, float]  # length and width of the cart
 
 
-ToFast = Start | Correction | AppliedReading | Rebase | CameraHealth | Doubted | MapMoved
+ToFast = Start | GaveUp | Correction | AppliedReading | Rebase | CameraHealth | Doubted | MapMoved

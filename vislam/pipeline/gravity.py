@@ -44,7 +44,7 @@ class Start:
     Attributes:
         phase: now.
         settled: the start that survived its test, or had to do without; None before.
-        newest: the start that the filter runs from, provisional or settled; None before.
+        newest: the start that the filter runs from, provisional or settled; None before, and where it was given up.
         first_state: of keyframe 0, once gravity is known.
         refusal: why there was no state when it was last looked for.
         scaled_from_ns: before, poses of one camera have no scale; None: all have.
@@ -115,7 +115,7 @@ class Start:
 
     def give_up(self) -> None:
         """Go on without gravity, by vision that is metric."""
-        self.phase = Phase.VISION_ALONE
+        self.newest, self.phase = None, Phase.VISION_ALONE
 
 
 class GravityWait:

@@ -27,6 +27,8 @@ from vislam.pipeline.steps import Estimate
 from vislam.sensors import Suite
 
 _KNOWN_MOTION_M = 0.02  # sigma of the motion between two frames below which the filter may overrule the image
+_FELT_NS, _FRESH_NS = 100_000_000, 1_000_000_000  # of samples that say what is level, and how old they may be
+_ASTRAY_RAD, _ASTRAY_M_S = 0.4, 10.0  # sigmas of a filter that is to begin again
 _SWAY_M_S = 0.03  # that a filter at rest may take for speed; a body that sets off is soon faster
 
 
@@ -107,15 +109,24 @@ class Inertial:
     def level_after_hole(self, last_t_ns: int, t_ns: int, keyframe_id: int, T_odom_body: Array | None) -> None:
         """Begin the filter again, level by the newest samples, after a hole in which neither camera nor IMU measured.
 
-        A body has turned by an unknown angle meanwhile, and a linear filter comes back from half a radian at most.
-        `T_odom_body` [4, 4] is where it was at the last frame.
+        A body has turned by an unknown angle meanwhile, and a linear filter comes back from half a radian at most. Many
+        holes among frames that vision lost come to the same. `T_odom_body` [4, 4] is where it was at the last frame.
         """
-        felt = self.buffer.after_hole(last_t_ns, t_ns)
+        felt = self.buffer.after_hole(last_t_ns, t_ns) or self._felt_astray(t_ns)
         if felt is None or T_odom_body is None or self.filtering.state is None:
             return
         yaw = float(np.arctan2(T_odom_body[1, 0], T_odom_body[0, 0]))
         R = so3_exp(np.array([0.0, 0.0, yaw])) @ level_rotation(felt.accel_m_s2.mean(axis=0))
-        self.filtering.tear(lost_motion(t_ns, keyframe_id, True), transform(R, T_odom_body[:3, 3]))
+        known_m2 = np.zeros((3, 3)) if self._at_frame is None else self._at_frame.covariance[3:6, 3:6]
+        self.filtering.tear(lost_motion(t_ns, keyframe_id, True), transform(R, T_odom_body[:3, 3]), known_m2)
+
+    def _felt_astray(self, t_ns: int) -> ImuSpan | None:
+        """Return the newest samples before a frame, if the filter knows too little there; those to come may do."""
+        until_ns = min(self.buffer.newest_t_ns or 0, t_ns)
+        from_ns, state = until_ns - _FELT_NS, self.filtering.ekf.state_at(until_ns)
+        if state is None or not _is_astray(state) or self.buffer.gap_s(from_ns, until_ns) * 1e9 > _FELT_NS:
+            return None
+        return self.buffer.span(from_ns, until_ns) if t_ns - until_ns < _FRESH_NS else None
 
     def between_keyframes(self, from_ns: int, to_ns: int) -> ImuSpan | None:
         """Return the samples between two keyframes, if what was seen between them does not contradict them."""
@@ -168,6 +179,13 @@ class Inertial:
         """Let the graph's biases correct the filter's, if the configuration wants that; the pose does not move."""
         self._of_graph = update.newest
         self.filtering.feed_back(update)
+
+
+def _is_astray(state: NavState) -> bool:
+    """Return whether a filter knows less of tilt or speed than one that begins again."""
+    R, P = state.T_world_body[:3, :3], state.covariance
+    tilt_rad2 = np.diag(R @ P[:3, :3] @ R.T)[:2].max()
+    return bool(tilt_rad2 > _ASTRAY_RAD**2 or np.trace(P[6:9, 6:9]) > _ASTRAY_M_S**2)
 
 
 def _uncorrected(last: NavState, span: ImuSpan, gravity_m_s2: float, at_rest: bool) -> Array:

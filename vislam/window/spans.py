@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vislam.config import MachineConfig, WindowConfig
 from vislam.core.geometry import so3_exp, transform
-from vislam.core.messages import Array, ImuSpan
+from vislam.core.messages import Array, ImuSpan, KeyframePacket, Tracking
 from vislam.core.readings import Motion
 from vislam.imu import ImuNoise, Preintegrated, preintegrate
 from vislam.window.equations import STATE, Links
@@ -17,6 +17,7 @@ _REINTEGRATE_ACCEL_M_S2 = 0.05
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSES = 12  # errors of two poses
 _HEAR_AGAIN_RAD, _HEAR_AGAIN_M = 0.002, 0.01  # a link's change within which its readings stay linear: mm at 1 m/s
+_ANY_SPEED_M_S = 3.0  # sigma where vision was lost: among holes, tilt would make it hundreds of metres a second
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
 
 
@@ -68,17 +69,15 @@ class LinkStore:
             return False
         return float(self._holes_s(span).sum()) <= self._machine.max_outage_s
 
-    def push(
-        self, span: ImuSpan | None, dt_s: float, bias: Array, guess: Array, at_rest: bool, motions: Sequence[Motion]
-    ) -> bool:
+    def push(self, packet: KeyframePacket, dt_s: float, bias: Array, guess: Array, motions: Sequence[Motion]) -> bool:
         """Append the link to a new keyframe `dt_s` later; return whether it is inertial.
 
         `guess` [4, 4] is the motion that is assumed, loosely, where there is no inertial data; `bias` [6] is taken off.
         `motions` is what further sensors say of it, see `hear`.
         """
         k, links, machine = len(self._spans), self._links, self._machine
-        inertial = self.usable(span)
-        self._spans.append(span if inertial else None)
+        inertial = self.usable(packet.imu)
+        self._spans.append(packet.imu if inertial else None)
         self._motions.append(motions)
         links.inertial[k], links.dt[k], links.told[k] = inertial, dt_s, False
         links.guess_weight[k], links.velocity_weight[k], links.rest_weight[k + 1] = 0.0, 0.0, 0.0
@@ -92,10 +91,12 @@ class LinkStore:
             links.guess_weight[k, 0] = 1.0 / (np.deg2rad(machine.lost_rate_sigma_deg_s) * dt_s)
             links.guess_weight[k, 1] = 1.0 / (machine.lost_speed_sigma_m_s * dt_s)
             links.velocity_weight[k] = 1.0 / machine.lost_speed_sigma_m_s
-        if at_rest:
+        if packet.at_rest and self._noise is not None:
             links.guess[k] = np.eye(4)
             links.guess_weight[k] = 1.0 / np.deg2rad(machine.rest_sigma_deg), 1.0 / machine.rest_sigma_m
             links.rest_weight[k + 1] = 1.0 / machine.rest_speed_sigma_m_s
+        elif packet.vo.tracking is Tracking.LOST and not motions:
+            links.rest_weight[k + 1] = 1.0 / _ANY_SPEED_M_S
         return inertial
 
     def carried(self, x: Array, axes: Array) -> Array:

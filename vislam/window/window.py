@@ -231,8 +231,7 @@ class SlidingWindow:
         motion = by_odometry
         if motion is None:
             motion = self._keyframes.assumed_motion(packet, dt_s, self._full)
-        span = packet.imu if self._full else None
-        inertial = self._links.push(span, dt_s, last[15:].copy(), motion, packet.at_rest and self._full, motions)
+        inertial = self._links.push(packet, dt_s, last[15:].copy(), motion, motions)
         if inertial and (by_odometry is None or self._speed_sigma_m_s <= _UNKNOWN_SPEED_M_S):
             return self._links.carried(last, self._calibration.values[AXES:])
         x, R = last.copy(), last[:9].reshape(3, 3)

@@ -144,7 +144,7 @@ def _loop(
         if now_ns - noted_ns > _NOTE_S * _NS:
             noted_ns = now_ns
             power_up(fast, source)
-            life.note(status=fast.status(), latency_ms=latency.summary_ms(), power_up=fast.power_up_report())
+            life.note(status=fast.status(), latency_ms=latency.summary_ms(), power_up=fast.alone.report())
 
 
 class Messages:
@@ -171,7 +171,7 @@ def power_up(fast: FastPath, source: InertialSource) -> None:
     """Look for the zero of a cart that stands; once it is there, the source takes the gyro's drift from it off."""
     zero = fast.power_up(source.temperature_c)
     if zero is not None and zero.temperature_c is not None:
-        source.zeroed_at(zero.temperature_c, fast.bias_per_c)
+        source.zeroed_at(zero.temperature_c, fast.alone.bias_per_c)
 
 
 def warm_up(config: Config, noise: ImuNoise, T_body_camera: Array) -> None:

@@ -274,7 +274,7 @@ class FrontProcess:
 
     def _judge(self, t_ns: int) -> None:
         """Mark the pose as doubtful or not, and log why; nothing while the run begins."""
-        if self.front.start is None or t_ns - self._judged_t_ns < _JUDGE_NS:
+        if self.front.begun.holds_keyframes or t_ns - self._judged_t_ns < _JUDGE_NS:
             return
         self._judged_t_ns = t_ns
         verdict = judge(front_evidence(self._report(), self._config.machine), self._config.verdict)
