@@ -36,6 +36,7 @@ sys.path.append(str(REPOSITORY / "experiments"))  # for what is tested of them
 QUICK = {line for line in (TESTS / "quick.txt").read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
 _LIBC = ctypes.CDLL(None)
 _LEFT_OPEN = 16  # by libraries, once
+_RARELY = 50_000  # new objects between two searches for garbage, as in the verbs
 _M_MMAP_THRESHOLD, _MAPPED_BYTES = -3, 1 << 20
 
 # Compilation makes first examples slow, and a build must not fail by chance: fixed examples, no deadline.
@@ -91,6 +92,7 @@ def pytest_collection_finish() -> None:
     """Take what is imported by now out of Python's search for garbage, which would walk through all of it each time."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(_RARELY)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ _REINTEGRATE_ACCEL_M_S2 = 0.05
 _ROTATION, _VELOCITY, _POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 _POSES = 12  # errors of two poses
 _HEAR_AGAIN_RAD, _HEAR_AGAIN_M = 0.002, 0.01  # a link's change within which its readings stay linear: mm at 1 m/s
-_ANY_SPEED_M_S = 3.0  # sigma where vision was lost: among holes, tilt would make it hundreds of metres a second
+_ANY_SPEED_M_S = 10.0  # sigma where vision was lost: among holes, tilt would make it hundreds of metres a second
 _DAMP = 1e-18  # on the covariance of a span of one short step, whose position part is nearly singular
 
 
