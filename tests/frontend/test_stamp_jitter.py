@@ -80,12 +80,12 @@ def test_jitter_is_noise_along_the_motion_of_both_ends():
     image = np.zeros((4, 4), np.uint8)
     for index, (vo, span) in enumerate(seen(even(60), stamp_s)):
         clock.in_imu_time(Frame(vo.t_ns, index, (image,)))
-        loosened = clock.loosened(vo, span, state)
+        jittered = clock.jittered(vo, span, state)
         if vo.t_ns > 0.5 * PERIOD_S * 60 * 1e9 and index % 10 == 0:
             clock.took_keyframe()
-    more = np.diag(loosened.covariance - vo.covariance)
+    more = np.diag(jittered.covariance - vo.covariance)
     assert more[3] == pytest.approx(2.0 * (1.5 * clock.jitter_s) ** 2, rel=0.1)
     assert more[4] < 0.1 * more[3]
     rate = span.gyro_rad_s.mean(axis=0)
     assert more[:3].sum() == pytest.approx(2.0 * (np.linalg.norm(rate) * clock.jitter_s) ** 2, rel=0.5)
-    assert clock.loosened(vo, None, None).covariance == pytest.approx(vo.covariance, abs=1e-5)
+    assert clock.jittered(vo, None, None).covariance == pytest.approx(vo.covariance, abs=1e-5)

@@ -104,29 +104,32 @@ class CameraClock:
         return _WIDER * self.sigma_s * change / ((int(span.t_ns[-1]) - int(span.t_ns[0])) / _NS)
 
     def loosened(self, vo: VoMeasurement, span: ImuSpan | None, state: NavState | None) -> VoMeasurement:
-        """Return a motion with the noise that comes of its two stamps; usually as it is.
+        """Return a motion with the noise that comes of two stamps made with different offsets; usually as it is."""
+        shift_s = abs(self._corrected_ns - self._keyframe_ns) / _NS
+        if shift_s == 0.0 or vo.T_keyframe_body is None:
+            return vo
+        rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
+        speed = _FASTEST_M_S if state is None else float(np.linalg.norm(state.velocity_world_m_s))
+        along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way says nothing then
+        extra = np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
+        return replace(vo, covariance=vo.covariance + extra)
 
-        Each is off by its jitter, and two that were made with different offsets by the difference.
+    def jittered(self, vo: VoMeasurement, span: ImuSpan | None, state: NavState | None) -> VoMeasurement:
+        """Return a motion as one between the times of its stamps, each of which is off by the jitter.
+
+        Between the images, whose own poses a graph has, it is as good as ever.
         """
         self._jitter.see(vo, span, np.zeros(3) if state is None else state.gyro_bias_rad_s)
-        if vo.T_keyframe_body is None:
-            return vo
-        jitter_s, shift_s = self._jitter.sigma_s, abs(self._corrected_ns - self._keyframe_ns) / _NS
         self._twist = np.zeros(6)
         if span is not None:
             self._twist[:3] = span.gyro_rad_s.mean(axis=0)
         if state is not None and vo.has_scale:  # of a way without scale the direction stays
             self._twist[3:] = state.T_world_body[:3, :3].T @ state.velocity_world_m_s
-        extra = np.zeros((6, 6))
-        if jitter_s > 0.0:
-            for twist in (self._twist, se3_adjoint(invert(vo.T_keyframe_body)) @ self._keyframe_twist):
-                extra += jitter_s**2 * np.outer(twist, twist)
-        if shift_s > 0.0:
-            rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
-            speed = _FASTEST_M_S if state is None else float(np.linalg.norm(state.velocity_world_m_s))
-            along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way says nothing then
-            extra += np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
-        return replace(vo, covariance=vo.covariance + extra) if extra.any() else vo
+        jitter_s = self.jitter_s
+        if jitter_s == 0.0 or vo.T_keyframe_body is None:
+            return vo
+        ends = np.array([self._twist, se3_adjoint(invert(vo.T_keyframe_body)) @ self._keyframe_twist])
+        return replace(vo, covariance=vo.covariance + jitter_s**2 * ends.T @ ends)
 
     def follow(self, vo: VoMeasurement, buffer: ImuBuffer, is_started: bool) -> int:
         """Learn from the newest frame's motion and return by how many ns the applied offset changes from now on.

@@ -253,6 +253,8 @@ class Front:
         if self._imu is None:
             return self._by_vision.follow(track.vo, chain.T_vo_body.copy(), chain.is_torn), None
         shows_scale = self.watch.uniform.shows_scale
+        if self.frontend.mode != "planar":  # whose motions have a jitter already
+            track = replace(track, vo=self.camera_clock.jittered(track.vo, since.span, since.state))
         estimate, state = self._imu.correct(track, at_rest, shows_scale, since.span, chain.by_vision(track.vo))
         chain.T_odom_body = None if estimate is None else estimate.T_odom_body
         return estimate, state

@@ -26,8 +26,10 @@ from vislam.frontend.planar.floor_tracks import FloorTracks, Steps
 from vislam.frontend.planar.place import (
     MIN_CELLS,
     MIN_POINTS,
+    STAMP_JITTER_S,
     Course,
     Place,
+    by_jitter,
     by_tilt,
     failure,
     weakness,
@@ -183,6 +185,7 @@ class PlanarFrontEnd:
         good, weak = fit.inliers.copy(), ""
         if not why_not:
             covariance = covariance + by_tilt(fit, T, self._tilt.covariance, self._planar)
+            covariance += by_jitter(self._course.rate, pair.R_now, STAMP_JITTER_S)
             off_px = from_epipolar_segment(T, pair.rays, xy, 1.0 / self._config.min_depth_m) / pair.px
             with np.errstate(invalid="ignore"):
                 good |= off_px < _EPIPOLAR_PX

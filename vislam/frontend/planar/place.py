@@ -10,7 +10,7 @@ from vislam.frontend.attempt import DEGRADED_INLIER_RATIO, DEGRADED_INLIERS
 from vislam.frontend.planar.fit import Fit, scale_sigma
 from vislam.frontend.planar.floor import Turn
 
-_STAMP_JITTER_S = 0.002  # of frames, by a webcam over USB; in a turn 1 ms is 0.05 deg
+STAMP_JITTER_S = 0.002  # of frames, by a webcam over USB; in a turn 1 ms is 0.05 deg
 _CORRELATION_M = 10.0  # way over which an error of height or tilt adds up: the size of a room
 MIN_POINTS = 20  # of the floor that agree on a motion; fewer: lost
 MIN_CELLS = 4  # of 8 parts of the floor in which they lie
@@ -133,6 +133,13 @@ def by_tilt(fit: Fit, T_key_cam: Array, tilt_covariance: Array, config: PlanarCo
     return out
 
 
+def by_jitter(rate: Array, R_level_cam: Array, jitter_s: float) -> Array:
+    """Return the covariance [6, 6] of a motion whose ends were stamped a little early or late, at a rate [3]."""
+    turning, moving = R_level_cam[2] * rate[0], rate[1:] @ R_level_cam[:2]
+    step = np.concatenate([turning, moving]) * jitter_s
+    return 2.0 * np.outer(step, step)
+
+
 def failure(fit: Fit, candidates: int, course: Course, config: PlanarConfig) -> str:
     """Return why a fit cannot be believed, or an empty string."""
     if fit.failure:
@@ -145,7 +152,7 @@ def failure(fit: Fit, candidates: int, course: Course, config: PlanarConfig) -> 
     if is_split or not course.knows_yaw:
         return ""
     # the prior pulls: what is left of a contradiction is the smaller, the weaker the floor is
-    jitter_rad = np.sqrt(2.0) * _STAMP_JITTER_S * course.rate[0]  # of the stamps at both ends
+    jitter_rad = np.sqrt(2.0) * STAMP_JITTER_S * course.rate[0]  # of the stamps at both ends
     gyro_rad = _LENS_YAW_RAD + course.yaw_sigma_rad
     sigma_rad = float(np.sqrt(fit.covariance[0, 0] + gyro_rad**2 + jitter_rad**2))
     limit = max(config.yaw_gate_sigmas * sigma_rad, np.deg2rad(_YAW_GATE_DEG))
