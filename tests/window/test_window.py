@@ -9,10 +9,10 @@ import pytest
 from scipy.stats import chi2
 
 from vislam.config import WindowConfig
+from vislam.core import Array, ImuSpan, KeyframePacket, NavState, Observations, Tracking
 from vislam.core.camera import EXACT, CameraSigmas, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import invert, se3_log
-from vislam.core.messages import Array, ImuSpan, KeyframePacket, NavState, Observations, Tracking
 from vislam.window import SlidingWindow, WindowUpdate, gate
 from worlds.motion import EUROC_NOISE, NS, T0_NS, Motion, state_error
 from worlds.parts import MACHINE, with_slips

@@ -170,7 +170,7 @@ class Front:
         with self._clock.measure("ekf"):
             if self.gravity is not None:
                 ready = self.gravity.seek(since.span, track, still_image, at_rest, offset_sigma_s)
-            estimate, state = self._estimate(track, since, at_rest)
+            estimate, state = self._estimate(_late(track, since, self.camera_clock, self.frontend.mode), since, at_rest)
         T_odom_body = self._chain.T_vo_body.copy() if self._imu is None else estimate.T_odom_body if estimate else None
         if self.readings is not None:
             self.readings.see(frame.t_ns, T_odom_body)
@@ -253,8 +253,6 @@ class Front:
         if self._imu is None:
             return self._by_vision.follow(track.vo, chain.T_vo_body.copy(), chain.is_torn), None
         shows_scale = self.watch.uniform.shows_scale
-        if self.frontend.mode != "planar":  # whose motions have a jitter already
-            track = replace(track, vo=self.camera_clock.jittered(track.vo, since.span, since.state))
         estimate, state = self._imu.correct(track, at_rest, shows_scale, since.span, chain.by_vision(track.vo))
         chain.T_odom_body = None if estimate is None else estimate.T_odom_body
         return estimate, state
@@ -301,6 +299,11 @@ class Front:
     def report(self) -> FrontReport:
         """Return what there is to say of the run so far."""
         return report_of(self)
+
+
+def _late(track: TrackResult, since: Since, clock: CameraClock, mode: str) -> TrackResult:
+    """Return what vision says to a filter, whose times are the stamps': with their jitter, unless it has one."""
+    return track if mode == "planar" else replace(track, vo=clock.jittered(track.vo, since.span, since.state))
 
 
 def _as_blind(track: TrackResult, mode: str) -> TrackResult:
