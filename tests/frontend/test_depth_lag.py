@@ -11,7 +11,7 @@ from vislam.core.geometry import se3_exp
 from vislam.core.messages import Array, Frame
 from vislam.frontend.exposures import DepthLag
 from vislam.frontend.view import ImageDepth
-from vislam.vision.shutter import Shutter, later
+from vislam.vision.shutter import Shutter
 
 CAMERA = Camera(width=320, height=240, fx=260.0, fy=260.0, cx=160.0, cy=120.0)
 CONFIG = FrontEndConfig()
@@ -104,7 +104,10 @@ def test_how_long_rows_of_depth_take_is_learnt_beside_the_image(image_readout_s:
             plane_seen_from(se3_exp(s * twist)) @ [x, y, 1.0] for s, (x, y) in zip(late, xy, strict=True)
         ])  # fmt: skip
         read = lag.measure(sensor, frame, pixels, xy, true, twist, IDS)
-        true = later(np.column_stack([xy, true]), -late, twist)[:, 2]
+        true = np.array([
+            1.0 / (se3_exp(s * twist)[2] @ [x / rho, y / rho, 1.0 / rho, 1.0])
+            for s, (x, y), rho in zip(late, xy, true, strict=True)
+        ])  # fmt: skip
         lag.learn(read.rho - true, by_both(read.slope, pixels), read.sigma_rho, np.ones(len(xy), bool), 1.0 / 30.0)
     assert lag.rows_estimate_s == pytest.approx(depth_readout_s - image_readout_s, abs=0.003)
     assert lag.readout_s == pytest.approx(depth_readout_s, abs=0.003)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from vislam.config import FrontEndConfig
-from vislam.core import DataError
+from vislam.core import DataError, no_observations
 from vislam.core.geometry import invert, se3_log, so3_log, transform_points
-from vislam.core.messages import Array, Frame, Keyframe, Observations, Tracking, no_observations
+from vislam.core.messages import Array, Frame, Keyframe, Observations, Tracking
 from vislam.frontend import TrackResult, make_frontend
 from vislam.frontend.intake import Intake
 from vislam.frontend.metric import MetricFrontEnd

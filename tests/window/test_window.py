@@ -188,6 +188,11 @@ def test_known_rolling_shutter_is_accounted_for() -> None:
     world = World(Motion.random(4, 1.2), STEREO, 4, duration_s=3.0, readout_s=0.03, tracks=50, sigma_px=0.5)
     aware, truths, _ = run(world, replace(HONEST, readout_s=0.03, sigma_px=0.5, right_sigma_px=0.5))
     blind, _, _ = run(world, replace(HONEST, sigma_px=0.5, right_sigma_px=0.5))
+    window = SlidingWindow(replace(HONEST, sigma_px=0.5, right_sigma_px=0.5), STEREO, EUROC_NOISE, MACHINE)
+    packets, _ = world.packets()
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1000)))
+    learned = [window.add(replace(p, observations=replace(p.observations, readout_s=0.03))) for p in packets]
+    assert position_rmse(learned, truths) == position_rmse(aware, truths)
     assert position_rmse(aware, truths) < 0.5 * position_rmse(blind, truths)
 
 

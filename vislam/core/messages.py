@@ -121,6 +121,7 @@ class Observations:
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
     noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are given
     further: tuple[FurtherTracks, ...] = ()  # of the rig's further cameras
+    readout_s: float | None = None  # learned, of rows that are not undone; None: not known but to who was given it
 
     def __repr__(self) -> str:
         right = "" if self.right_px is None else f", {int(np.isfinite(self.right_px[:, 0]).sum())} in cam1"
