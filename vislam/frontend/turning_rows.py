@@ -1,7 +1,7 @@
 """Rolling shutter of one camera beside a gyroscope: rows are undone as far as it turns, and their readout is learnt.
 
-What the way between two rows does to an image needs depth, which one camera has not: whoever knows velocity and depth
-undoes that with the readout learnt here. It moves points along their epipolar lines as long as the camera goes on in
+What the way between two rows does to an image needs depth, which one camera has not: filter and window, which know
+velocity and depth, undo that with the readout learnt here. It moves points along their epipolar lines as long as the camera goes on in
 the same direction, and so hardly shows in how far they are from these, which is all that teaches here.
 """
 
@@ -35,7 +35,7 @@ class TurningRows:
 
     @property
     def learned_s(self) -> float | None:
-        """The readout for whoever has no stated one; None: there is one, or the shutter counts as global."""
+        """The readout for estimators that have no stated one; None: there is one, or the shutter counts as global."""
         return self._shutter.readout_s or None if self._shutter.learns else None
 
     def start_at(self, readout_s: float | None) -> None:
