@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vislam.config import FrontEndConfig
-from vislam.core import DataError, no_observations
+from vislam.core import DataError
 from vislam.core.geometry import invert, se3_log, so3_log, transform_points
 from vislam.core.messages import Array, Frame, Keyframe, Observations, Tracking
 from vislam.frontend import TrackResult, make_frontend
@@ -182,8 +182,8 @@ def test_rolling_shutter_is_found_from_given_tracks_and_undone_in_both_images() 
     frontend = make_frontend(CONFIG, recording.rig, 0)
     assert isinstance(frontend, MetricFrontEnd)
     by_shutter_px, disparities_px = list[Array](), list[Array]()
-    for event in recording.events():
-        seen = frontend.track(event, None).observations if isinstance(event, Frame) else no_observations()
+    for frame in (event for event in recording.events() if isinstance(event, Frame)):
+        seen = frontend.track(frame, None).observations
         if seen.instant_px is not None and seen.right_px is not None and seen.right_instant_px is not None:
             moved_px = seen.instant_px - seen.pixels_px
             bent_px = np.abs(seen.right_instant_px - seen.right_px - moved_px)

@@ -1,8 +1,8 @@
 """Rolling shutter of one camera beside a gyroscope: rows are undone as far as it turns, and their readout is learnt.
 
 What the way between two rows does to an image needs depth, which one camera has not: filter and window, which know
-velocity and depth, undo that with the readout learnt here. It moves points along their epipolar lines as long as the camera goes on in
-the same direction, and so hardly shows in how far they are from these, which is all that teaches here.
+velocity and depth, undo that with the readout learnt here. It moves points along their epipolar lines as long as the
+camera goes on in the same direction, and so hardly shows in how far they are from these, which is all that teaches.
 """
 
 import numpy as np
