@@ -177,16 +177,23 @@ def test_outage_is_lost_and_odometry_starts_again() -> None:
     assert any(result.reason.startswith("restarted") for _, result, _, _ in results[95:105])
 
 
-def test_rolling_shutter_is_found_from_given_tracks() -> None:
+def test_rolling_shutter_is_found_from_given_tracks_and_undone_in_both_images() -> None:
     recording = open_points("handheld-room", seed=1, readout_s=0.02, duration_s=8.0)
     frontend = make_frontend(CONFIG, recording.rig, 0)
     assert isinstance(frontend, MetricFrontEnd)
-    for event in recording.events():
-        if isinstance(event, Frame):
-            frontend.track(event, None)
+    by_shutter_px, disparities_px = list[Array](), list[Array]()
+    for frame in (event for event in recording.events() if isinstance(event, Frame)):
+        seen = frontend.track(frame, None).observations
+        if seen.instant_px is not None and seen.right_px is not None and seen.right_instant_px is not None:
+            moved_px = seen.instant_px - seen.pixels_px
+            bent_px = np.abs(seen.right_instant_px - seen.right_px - moved_px)
+            by_shutter_px.append(np.abs(moved_px).ravel())
+            disparities_px.append(bent_px[np.isfinite(bent_px)])
     found_s = frontend.learned.readout_s
-    print(f"seed 1: {found_s} of 0.02 s")
+    moved, bent = (float(np.mean(np.concatenate(px))) for px in (by_shutter_px, disparities_px))
+    print(f"seed 1: {found_s} of 0.02 s; undoing it moves a pixel by {moved:.2f} px, a disparity by {bent:.2f} px")
     assert found_s == pytest.approx(0.02, abs=0.003)
+    assert moved > 0.5 and bent < 0.2 * moved
 
 
 def test_keyframes_behind_a_rolling_shutter_agree_where_their_features_are() -> None:

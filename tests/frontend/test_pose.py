@@ -5,9 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vislam.config import FrontEndConfig
+from vislam.core import ImuSpan
 from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_exp, se3_log, so3_exp, so3_log
 from vislam.core.messages import Array
+from vislam.frontend.turning_rows import TurningRows
 from vislam.vision.landmarks import UNKNOWN_RHO_SIGMA, Landmarks, fuse, move, predict
 from vislam.vision.locate import pnp_ransac
 from vislam.vision.refine import extra_parameter, pose_covariance, refine_pose
@@ -317,3 +320,26 @@ def test_the_readout_time_is_learned_from_the_shear_it_leaves(readout_s: float) 
         slope = -shutter.slope(pixels, xy, landmarks[:, 2], twist)
         shutter.learn(*extra_parameter(estimate.T_key_cam, landmarks, P, xy, SIGMA, 3.0, slope))
     assert shutter.readout_s == pytest.approx(readout_s, abs=0.003)
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.03])
+def test_one_camera_learns_the_readout_beside_a_gyroscope(readout_s: float) -> None:
+    rng = np.random.default_rng(9)
+    rows = TurningRows(CAMERA, np.eye(3), FrontEndConfig())
+    for _ in range(25):
+        landmarks, T = scene(rng, 150), se3_exp(rng.normal(0.0, [0.05, 0.05, 0.05, 0.2, 0.2, 0.2]))
+        twists = np.column_stack([rng.normal(0.0, 0.8, (2, 3)), [5.0 * T[:3, 3], 5.0 * T[:3, :3].T @ T[:3, 3]]])
+        ends = [
+            rolling(seen_from(landmarks, at), twist, readout_s)[0]
+            for at, twist in zip((np.eye(4), T), twists, strict=True)
+        ]
+        noisy = [px + rng.normal(0.0, 0.3, px.shape) for px in ends]
+        for twist in twists:
+            rows.begin()
+            rows.take(ImuSpan(np.array([0]), twist[None, :3], np.zeros((1, 3))))
+        rows.look(noisy[0])
+        xy = rows.now_xy(noisy[1])
+        view = refine_two_view(T[:3, :3], T[:3, 3], rows.key_xy, xy, SIGMA, 3.0)
+        rows.learn(view, noisy[1], SIGMA, None)
+    print(f"{rows.learned_s} of {readout_s} s")
+    assert rows.learned_s == (pytest.approx(readout_s, abs=0.003) if readout_s else None)

@@ -188,7 +188,27 @@ def test_known_rolling_shutter_is_accounted_for() -> None:
     world = World(Motion.random(4, 1.2), STEREO, 4, duration_s=3.0, readout_s=0.03, tracks=50, sigma_px=0.5)
     aware, truths, _ = run(world, replace(HONEST, readout_s=0.03, sigma_px=0.5, right_sigma_px=0.5))
     blind, _, _ = run(world, replace(HONEST, sigma_px=0.5, right_sigma_px=0.5))
+    window = SlidingWindow(replace(HONEST, sigma_px=0.5, right_sigma_px=0.5), STEREO, EUROC_NOISE, MACHINE)
+    packets, _ = world.packets()
+    window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(1000)))
+    learned = [window.add(replace(p, observations=replace(p.observations, readout_s=0.03))) for p in packets]
+    assert position_rmse(learned, truths) == position_rmse(aware, truths)
     assert position_rmse(aware, truths) < 0.5 * position_rmse(blind, truths)
+
+
+def test_images_whose_shutter_is_undone_count_as_those_of_a_global_one() -> None:
+    packets, truths = World(Motion.random(4), STEREO, 4, duration_s=1.5, tracks=50).packets()
+    places = []
+    for moved_px in np.array([[0.0, 0.0], [5.0, 0.0]]):
+        window = SlidingWindow(HONEST, STEREO, EUROC_NOISE, MACHINE)
+        window.initialise(start_state(truths[0], packets[0].keyframe.t_ns, np.random.default_rng(0)))
+        for p in packets:
+            left, right = p.observations.pixels_px, p.observations.right_px
+            assert right is not None
+            undone = replace(p.observations, instant_px=left, right_instant_px=right)
+            seen = replace(undone, pixels_px=left + moved_px, right_px=right + moved_px)
+            places.append(window.add(replace(p, observations=seen)).T_local_body[-1])
+    assert np.array_equal(places[: len(packets)], places[len(packets) :])
 
 
 def test_outliers_are_taken_out() -> None:

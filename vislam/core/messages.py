@@ -117,9 +117,11 @@ class Observations:
     right_px: Array | None = None  # [N, 2] in cam1, NaN where not matched
     depth_m: Array | None = None  # [N] z-depth in cam0, NaN where unknown
     instant_px: Array | None = None  # [N, 2] at the frame's own time, rolling shutter undone; None: as above
+    right_instant_px: Array | None = None  # [N, 2] the same in cam1; with `instant_px` where there is `right_px`
     descriptors: NDArray[np.uint8] | None = None  # [N, 32] for loop closing, only of tracks that came without images
     noise: float = 1.0  # standard deviations of pixels and depths over those that estimators are given
     further: tuple[FurtherTracks, ...] = ()  # of the rig's further cameras
+    readout_s: float | None = None  # learned, of rows that are not undone; None: not known but to who was given it
 
     def __repr__(self) -> str:
         right = "" if self.right_px is None else f", {int(np.isfinite(self.right_px[:, 0]).sum())} in cam1"
@@ -135,11 +137,12 @@ class Observations:
 
 def chosen(given: Observations, which: Bools) -> Observations:
     """Return those of tracks [N] that are chosen [N]."""
-    parts = (given.right_px, given.depth_m, given.instant_px)
-    right, depth, instant = (None if part is None else part[which] for part in parts)
+    parts = (given.right_px, given.depth_m, given.instant_px, given.right_instant_px)
+    right, depth, instant, right_instant = (None if part is None else part[which] for part in parts)
     return replace(
         given, track_ids=given.track_ids[which], pixels_px=given.pixels_px[which], right_px=right, depth_m=depth,
-        instant_px=instant, descriptors=None if given.descriptors is None else given.descriptors[which],
+        instant_px=instant, right_instant_px=right_instant,
+        descriptors=None if given.descriptors is None else given.descriptors[which],
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from vislam.frontend.keyframes import PATIENCE_S, Exposed
 from vislam.frontend.tracker import Tracker, given_rows
 from vislam.frontend.view import EPIPOLAR_GATE_PX, DepthReading, View, spread
 from vislam.vision.landmarks import Landmarks, move
+from vislam.vision.shutter import Shutter
 
 _CORNER_SIGMA = 0.1  # of the track noise: the patch in the keyframe is the landmark, by definition
 _DEEP = 0.02  # of a keyframe's tracks have depth at least, or its sensor is covered: wrong matches alone are fewer
@@ -31,9 +32,10 @@ class KeyframeTracks:
         lacks_depth: hardly a track of the keyframe had depth when it began.
     """
 
-    def __init__(self, config: FrontEndConfig, usual: View) -> None:
-        """Begin without tracks, looking through the `usual` camera."""
-        self.view = self.usual = usual
+    def __init__(self, config: FrontEndConfig, views: tuple[View, ...]) -> None:
+        """Begin without tracks, looking through the first of the cameras, the usual one."""
+        self.view = self.usual = usual = views[0]
+        self._other = views[-1]
         self.tracker = Tracker(config)
         self.landmarks = Landmarks()
         self.exposures = Exposures(usual.camera, config)
@@ -114,7 +116,7 @@ class KeyframeTracks:
         self.forget()
         count = self.tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         reading = self._add_landmarks(frame, count, twist_per_s)
-        return self._all(self.tracker.pixels, reading, self.landmarks.mean[:, :2])
+        return self._all(self.tracker.pixels, reading, self.landmarks.mean[:, :2], twist_per_s)
 
     def carry_on(self, frame: Frame, attempt: Attempt) -> Observations:
         """Carry tracks that agree into a keyframe, improve their landmarks by what it measures, fill the gaps."""
@@ -136,7 +138,7 @@ class KeyframeTracks:
         instant = np.vstack([attempt.xy[kept], landmarks.mean[len(landmarks.mean) - count :, :2]])
         measured = reading.joined(fresh)
         self.lacks_depth = len(measured.rho) > np.isfinite(measured.rho).sum() / _DEEP
-        return self._all(seen_at, measured, instant)
+        return self._all(seen_at, measured, instant, twist)
 
     def exposed(self, whole: Frame, twist_per_s: Array) -> Exposed:
         """Return when rows and depth of a new keyframe were taken, at a velocity [6] of the camera."""
@@ -163,14 +165,29 @@ class KeyframeTracks:
         self.landmarks.append(xy, reading.rho, sigma_xy, reading.sigma_rho, reading.slope)
         return reading
 
-    def _all(self, pixels: Array, reading: DepthReading, xy: Array) -> Observations:
+    def _all(self, pixels: Array, reading: DepthReading, xy: Array, twist_per_s: Array) -> Observations:
         """Return what a keyframe sees: raw pixels [N, 2] and directions [N, 2] of the middle row's time."""
         ids = self.tracker.ids.copy()
         if self.view.is_swapped:
             return self._as_usual_would(ids, xy, self.landmarks.mean, self.landmarks.covariance)
         return Observations(
-            ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self.exposures.shutter.instant_px(xy)
-        )
+            ids, pixels.copy(), reading.right_px, reading.depth_m, instant_px=self.exposures.shutter.instant_px(xy),
+            right_instant_px=self._right_at_once(xy, reading, twist_per_s),
+        )  # fmt: skip
+
+    def _right_at_once(self, xy: Array, reading: DepthReading, twist_per_s: Array) -> Array | None:
+        """Return where a second camera would have seen the same at the middle row's time; None as `Shutter.instant_px`.
+
+        Both read their rows at the same times. Undone in one image alone, the shear would become disparity.
+        """
+        right_px, other = reading.right_px, self._other
+        shutter = Shutter(other.camera, self.exposures.shutter.readout_s)
+        if right_px is None or shutter.readout_s == 0.0:
+            return None
+        there, _ = self.view.carry(np.column_stack([xy, reading.rho]), np.zeros((len(xy), 3, 3)), other)
+        twist_there = se3_adjoint(np.asarray(invert(other.T_body_cam) @ self.view.T_body_cam)) @ twist_per_s
+        seen = other.camera.normalise(right_px)
+        return shutter.instant_px(shutter.to_instant(right_px, seen, there[:, 2], twist_there))
 
     def _as_usual_would(self, ids: NDArray[np.int64], xy: Array, means: Array, covariances: Array) -> Observations:
         gate_px = EPIPOLAR_GATE_PX

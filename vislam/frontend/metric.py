@@ -94,7 +94,7 @@ class MetricFrontEnd:
         self._usual = usual = views[0]
         self._intake = Intake(rig, seed)
         self._life = KeyframeLife(config, has_scale=True)
-        self._tracks = KeyframeTracks(config, usual)
+        self._tracks = KeyframeTracks(config, views)
         self._placer = Placer(config, self._tracks)
         self._second = SecondCamera(config, views, self._tracks, self._placer)
         self._noise = PixelNoise(config.track_sigma_px)

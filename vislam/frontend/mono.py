@@ -20,6 +20,7 @@ from vislam.frontend.keyframes import PATIENCE_S, KeyframeLife, keyframe_reason
 from vislam.frontend.pixel_noise import PixelNoise
 from vislam.frontend.result import CommonErrors, TrackResult, too_few, unscaled_motion
 from vislam.frontend.tracker import MIN_START_CORNERS, Tracker
+from vislam.frontend.turning_rows import TurningRows
 from vislam.vision.refine import refine_pose
 from vislam.vision.two_view import (
     RotationPrior,
@@ -106,6 +107,7 @@ class MonoFrontEnd:
         self._intake = Intake(rig, seed)
         self._tracker = Tracker(config)
         self._noise = PixelNoise(config.track_sigma_px)
+        self._rows = TurningRows(self._camera, self._R_body_cam, config)
         self._predictor = MotionPredictor(self._T_body_cam, PATIENCE_S)
         self._limits = _Limits.of(config, self._camera.fx, is_given=False)
         self._life = KeyframeLife(config, has_scale=False)
@@ -114,7 +116,6 @@ class MonoFrontEnd:
         self._R_key_gyro: Array = np.eye(3)  # of the last frame, by the gyroscope alone
         self._gyro_sigma_rad = 0.0
         self._T_key_filter: Array | None = np.eye(4)  # of the last frame's camera, by the filter; None: not all known
-        self._key_xy: Array = np.empty((0, 2))  # of the tracks in the keyframe, on z = 1
         self._direction_key: Array = np.zeros(3)  # to the last frame, or where it will probably go; zero: not known
         self._lost = False
 
@@ -129,6 +130,7 @@ class MonoFrontEnd:
         self, frame: Frame, imu: ImuSpan | None, gyro_sigma_rad_s: float, T_last_now: Array | None
     ) -> TrackResult:
         frame, dt_s = self._intake.accept(frame)
+        self._rows.take(imu)
         given = _BOTH_ENDS if frame.tracks is not None else 1.0
         self._limits = _Limits.of(self._config, self._camera.fx, frame.tracks is not None)
         if self._life.keyframe is None:
@@ -140,7 +142,7 @@ class MonoFrontEnd:
         last = np.column_stack([self._camera.normalise(self._last_px), np.ones(len(self._last_px))])
         guess = self._camera.project(last @ R_now_next)
         pixels = self._tracker.follow(frame, guess)
-        self._key_xy = self._camera.normalise(self._tracker.pixels)
+        self._rows.look(self._tracker.pixels)
         found = np.isfinite(pixels[:, 0])
         self._last_px = np.where(found[:, None], pixels, guess)
         located = self._locate(R_guess, prior, pixels)
@@ -156,6 +158,7 @@ class MonoFrontEnd:
         self._lost = False
         self._life.placed(frame.t_ns)
         self._learn_noise(motion, given**2)
+        self._rows.learn(motion.view, motion.pixels, self._limits.sigma_xy, prior)
         outliers = 1.0 - int(located.agreeing.sum()) / max(located.followed, 1)
         return replace(self._report(frame, motion), outliers=outliers)
 
@@ -168,11 +171,12 @@ class MonoFrontEnd:
         """See FrontEnd.begin_at."""
         self._life.begin_at(keyframe_id, seeks_place)
         self._tracker.next_id = learned.next_track_id
+        self._rows.start_at(learned.readout_s)
 
     @property
     def learned(self) -> Learned:
         """See FrontEnd.learned."""
-        return Learned(self._tracker.next_id)
+        return Learned(self._tracker.next_id, readout_s=self._rows.learned_s)
 
     # -- placing one frame -------------------------------------------------------------------------------------------
 
@@ -193,12 +197,12 @@ class MonoFrontEnd:
             return motion
         self._T_key_filter = self._T_key_filter @ invert(self._T_body_cam) @ T_last_now @ self._T_body_cam
         nearest = 1.0 / self._config.min_depth_m
-        off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, self._key_xy, motion.xy, nearest)
+        off_px = self._camera.fx * from_epipolar_segment(self._T_key_filter, self._rows.key_xy, motion.xy, nearest)
         astray = off_px > self._config.astray_px
         return confirmed(motion, astray, lambda pixels: self._locate(R_guess, prior, pixels), self._config)
 
     def _locate(self, R_guess: Array, prior: RotationPrior | None, pixels: Array) -> _Motion:
-        key_xy, xy = self._key_xy, self._camera.normalise(pixels)
+        key_xy, xy = self._rows.key_xy, self._rows.now_xy(pixels)
         still = self._turn(R_guess, key_xy, xy) if prior is None else self._turn_by(prior, key_xy, xy)
         parallax_px = self._camera.fx * _parallax(still.R_key_cam if still.converged else R_guess, key_xy, xy)
         view = still
@@ -267,7 +271,7 @@ class MonoFrontEnd:
     def _learn_noise(self, motion: _Motion, ends: float) -> None:
         """Take note of the distances from epipolar lines; without a direction there are none."""
         T_key_cam = np.asarray(transform(motion.view.R_key_cam, motion.view.direction_key))
-        distances = epipolar_distances(T_key_cam, self._key_xy, motion.xy)
+        distances = epipolar_distances(T_key_cam, self._rows.key_xy, motion.xy)
         self._noise.learn(distances, self._camera, motion.xy, ends)
 
     # -- what comes of it --------------------------------------------------------------------------------------------
@@ -287,7 +291,7 @@ class MonoFrontEnd:
             self._tracker.begin(frame, good, pixels)
             new = self._install(frame)
             return TrackResult(vo, self._observations(), new, motion.parallax_px, reason)
-        observations = Observations(self._tracker.ids[good].copy(), motion.pixels[good])
+        observations = Observations(self._tracker.ids[good].copy(), motion.pixels[good], readout_s=self._rows.learned_s)
         self._last_px = self._last_px[self._tracker.judge(good)]
         return TrackResult(vo, observations, None, motion.parallax_px, weak)
 
@@ -321,7 +325,7 @@ class MonoFrontEnd:
         return self._life.started(self._observations(), count, why)
 
     def _observations(self) -> Observations:
-        return Observations(self._tracker.ids.copy(), self._tracker.pixels.copy())
+        return Observations(self._tracker.ids.copy(), self._tracker.pixels.copy(), readout_s=self._rows.learned_s)
 
     def _install(self, frame: Frame) -> Keyframe:
         keyframe = self._life.install(frame, self._camera, self._T_body_cam, len(self._tracker))
@@ -330,6 +334,7 @@ class MonoFrontEnd:
         self._R_key_cam = np.eye(3)
         self._R_key_gyro, self._gyro_sigma_rad = np.eye(3), 0.0
         self._T_key_filter = np.eye(4)
+        self._rows.begin()
         return keyframe
 
 

@@ -270,7 +270,7 @@ class View:
         points, covariance = self.carry(np.column_stack([xy, means[:, 2]]), covariance, other)
         pixels = other.camera.project(np.column_stack([points[:, :2], np.ones(len(points))]))
         told = other.camera.contains(pixels) & (other.camera.fx * spread(covariance) < gate_px)
-        return Observations(ids[told], pixels[told])
+        return Observations(ids[told], pixels[told], instant_px=pixels[told])
 
 
 def stereo_views(rig: Rig, config: FrontEndConfig) -> tuple[View, View]:

@@ -26,9 +26,12 @@ _STEP_S = 1e-3  # for the derivative by the readout
 class Shutter:
     """How the rows of a camera are spread in time."""
 
-    def __init__(self, camera: Camera, readout_s: float | None) -> None:
-        """Take the time from the first to the last row in seconds, 0 for a global shutter, None to estimate it."""
-        self._camera = camera
+    def __init__(self, camera: Camera, readout_s: float | None, least_sigmas: float = 0.0) -> None:
+        """Take the time from the first to the last row in seconds, 0 for a global shutter, None to estimate it.
+
+        An estimate of less than `least_sigmas` of its standard deviation counts as a global shutter.
+        """
+        self._camera, self._least_sigmas = camera, least_sigmas
         self._known = readout_s is not None
         self._estimate_s = readout_s if readout_s is not None else 0.0
         self.information = 1.0 / _SIGMA_S**2
@@ -36,7 +39,8 @@ class Shutter:
     @property
     def readout_s(self) -> float:
         """The readout that is applied, in seconds."""
-        return self._estimate_s if self._known or self._estimate_s > _GLOBAL_S else 0.0
+        least_s = max(_GLOBAL_S, self._least_sigmas * float(self.information**-0.5))
+        return self._estimate_s if self._known or self._estimate_s > least_s else 0.0
 
     @property
     def sigma_s(self) -> float:

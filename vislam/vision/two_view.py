@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +24,7 @@ _LONGEST = 3.0  # times the usual parallax that one track may count for
 _REWEIGHTED = 4
 _CONFIDENCE = 0.999
 _MAX_TRIES = 500
+_MOST_ALIKE = 1e9  # condition of rotation and direction beside one more parameter
 _ANY_DIRECTION = 1.0  # variance of each axis of a unit vector of which nothing is known
 
 
@@ -104,6 +106,43 @@ def refine_two_view(
     if ahead < behind:
         t = -t
     return TwoViewEstimate(R, t, covariance, inliers, bool(converged), float(variance))
+
+
+def extra_of_two_views(
+    view: TwoViewEstimate, xy: Sequence[Array], ahead: Sequence[Array], sigma_xy: float, cauchy: float,
+    prior: RotationPrior | None,
+) -> tuple[float, float]:  # fmt: skip
+    """Estimate one more parameter beside rotation and direction: one Gauss-Newton step with these marginalised.
+
+    Args:
+        view: the optimum without the parameter.
+        xy: directions [N, 2] in keyframe and camera, see `refine_two_view`.
+        ahead: the same where the parameter is larger by one.
+        sigma_xy: see `refine_two_view`.
+        cauchy: see `refine_two_view`.
+        prior: see `refine_two_view`.
+
+    Returns:
+        The change of the parameter and its information (inverse variance); zeros when nothing can be said.
+    """
+    R, t = np.ascontiguousarray(view.R_key_cam), np.ascontiguousarray(view.direction_key)
+    r, J = _linearise(R, t, tangent_basis(t), *xy, sigma_xy)
+    r_ahead, _ = _linearise(R, t, tangent_basis(t), *ahead, sigma_xy)
+    A = np.column_stack([J, r_ahead - r])
+    use = view.inliers & np.isfinite(r) & np.isfinite(r_ahead)
+    A, r = A[use], r[use]
+    weighted = A / (1.0 + (r / cauchy) ** 2)[:, None]
+    H, b = weighted.T @ A, weighted.T @ r
+    if prior is not None:
+        H[:3, :3] += np.eye(3) / prior.sigma_rad**2
+        b[:3] += so3_log(prior.R_key_cam.T @ R) / prior.sigma_rad**2
+    if not np.linalg.cond(H[:5, :5]) < _MOST_ALIKE:
+        return 0.0, 0.0
+    carried = np.linalg.solve(H[:5, :5], H[:5, 5])
+    information = float(H[5, 5] - carried @ H[:5, 5])
+    if not information > 0.0:
+        return 0.0, 0.0
+    return -float(b[5] - carried @ b[:5]) / information, information / max(1.0, view.variance)
 
 
 def epipolar_distances(T_key_cam: Array, key_xy: Array, xy: Array) -> Array:

@@ -111,9 +111,9 @@ def solve(
         tracks.add(k, seen)
     selection = tracks.select(ids)
     total = max(len(selection.rows), 1)
-    sigmas = _calibration_sigmas(problem, config, rig, noise)
+    calibration, sigmas = _calibration(problem, config, rig, noise)
     camera = _camera(problem, config, rig, sigmas > 0.0)
-    X, calibration = _states(problem), np.zeros(CALIBRATION)
+    X = _states(problem)
     held = np.zeros(count, dtype=np.bool_)
     links, gauge, room = _links(problem, noise), _gauge(problem, sigmas), Room()
     sigma, whitening, iterations = 1.0, 1.0, 0
@@ -147,11 +147,12 @@ def solve(
     )
 
 
-def _calibration_sigmas(problem: BundleProblem, config: WindowConfig, rig: Rig, noise: ImuNoise) -> Array:
-    """Return the sigmas [16] of what is estimated of the calibration, 0 for what is held."""
-    sigmas = Calibration(config, rig, noise, 0.0).start_sigmas
-    sigmas[:5] = 0.0 if problem.rate_rad_s is None else problem.time_offset_sigma_s, 0.0, 0.0, 0.0, 0.0
-    return sigmas
+def _calibration(problem: BundleProblem, config: WindowConfig, rig: Rig, noise: ImuNoise) -> tuple[Array, Array]:
+    """Return the calibration [16] to begin with and the sigmas [16] of what is estimated of it, 0 for what is held."""
+    known = Calibration(config, rig, noise, 0.0)
+    known.see(problem.observations[-1])
+    known.start_sigmas[:5] = 0.0 if problem.rate_rad_s is None else problem.time_offset_sigma_s, 0.0, 0.0, 0.0, 0.0
+    return known.values, known.start_sigmas
 
 
 def _camera(problem: BundleProblem, config: WindowConfig, rig: Rig, active: NDArray[np.bool_]) -> Camera:

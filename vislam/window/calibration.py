@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from vislam.config import WindowConfig
 from vislam.core.camera import Rig
 from vislam.core.lens import Lenses
-from vislam.core.messages import Array
+from vislam.core.messages import Array, Observations
 from vislam.imu import ImuNoise
 from vislam.window.equations import CALIBRATION
 from vislam.window.messages import CalibrationEstimate
@@ -42,6 +42,12 @@ class Calibration:
         self.start_sigmas: Array = self.wanted * sigmas
         self.values: Array = np.zeros(CALIBRATION)
         self.values[0], self.values[4] = time_offset_s, config.readout_s or 0.0
+        self._learns_readout = config.readout_s is None
+
+    def see(self, seen: Observations) -> None:
+        """Take the readout that was learned with a keyframe's tracks, unless one is stated."""
+        if self._learns_readout and seen.readout_s is not None:
+            self.values[4] = seen.readout_s
 
     def take(self, values: Array, applied_s: float) -> None:
         """Take a solution [16], with the time offset near to what is applied."""

@@ -58,7 +58,9 @@ class TrackTable:
         slots = self._slots(seen.track_ids[usable])
         self._append(slots, keyframe_id, 0, values[usable])
         if seen.right_px is not None and self._rig.is_stereo:
-            right = _rows_of(self._rig.cameras[1], seen.right_px, seen.noise * self._config.right_sigma_px)
+            at_once = seen.right_instant_px is not None
+            pixels = seen.right_px if seen.right_instant_px is None else seen.right_instant_px
+            right = _rows_of(self._rig.cameras[1], pixels, seen.noise * self._config.right_sigma_px, at_once)
             both = usable & np.isfinite(right).all(axis=1)
             if both.any():
                 place = np.cumsum(usable) - 1

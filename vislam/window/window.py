@@ -213,6 +213,7 @@ class SlidingWindow:
             self._tracks.remove(self._tracks.keyframe == keyframes.ids[-2])
         self._at_rest = packet.at_rest
         self._tracks.add(packet.keyframe.id, packet.observations)
+        self._calibration.see(packet.observations)
 
     def _first_state(self, packet: KeyframePacket) -> Array:
         """Return the state of the first keyframe, and set the prior on it."""

@@ -124,7 +124,9 @@ def states_before(
         while frames and (sample is None or mirror_ns - frames[0].t_ns <= sample.t_ns):
             frame = frames.pop(0)
             t_ns = mirror_ns - frame.t_ns
-            ekf.update_vision(_motion(t_ns, frame.observations), frame.observations)
+            learned_s = frame.observations.readout_s
+            backwards = replace(frame.observations, readout_s=None if learned_s is None else -learned_s)
+            ekf.update_vision(_motion(t_ns, backwards), backwards)
             if frame.at_rest:
                 ekf.update_zero_velocity(t_ns)
             if t_ns > mirror_ns - state.t_ns:

@@ -108,7 +108,9 @@ class MsckfEkf(SensedTimeline[TightState, FrameTracks]):
             return self._refuse("vision_lost", "tracking lost")
         if self._history is not None and self._history.holds(vo.t_ns, FrameTracks):
             return self._refuse("vision_duplicate", f"a frame of {vo.t_ns} ns is here already")
-        frame = prepare(vo.t_ns, observations, self._rig, self._readout_s, shows_scale)
+        readout_s = observations.readout_s
+        readout_s = self._readout_s if readout_s is None or self._readout_s != 0.0 else readout_s
+        frame = prepare(vo.t_ns, observations, self._rig, readout_s, shows_scale)
         if not len(frame.ids):
             return self._refuse("vision_invalid", "no track with finite pixels inside the camera model")
         return self._insert(Event(vo.t_ns, frame))

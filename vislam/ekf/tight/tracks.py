@@ -43,8 +43,9 @@ def prepare(t_ns: int, observations: Observations, rig: Rig, readout_s: float, s
     at_once = observations.instant_px is not None
     given = observations.instant_px if observations.instant_px is not None else observations.pixels_px
     ids, pixels, seen, first = _seen_by(0, rig, observations.track_ids, given, 0.0 if at_once else readout_s)
-    if observations.right_px is not None and rig.is_stereo:
-        seen[:, 4:8] = _rays(rig.cameras[1], np.asarray(observations.right_px, dtype=np.float64)[first])
+    right = observations.right_instant_px if at_once else observations.right_px
+    if right is not None and rig.is_stereo:
+        seen[:, 4:8] = _rays(rig.cameras[1], np.asarray(right, dtype=np.float64)[first])
     if observations.depth_m is not None:
         depth = np.asarray(observations.depth_m, dtype=np.float64)[first]
         good = np.isfinite(depth) & (depth > 0.0)

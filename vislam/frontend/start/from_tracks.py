@@ -237,4 +237,4 @@ def _only(seen: Observations | None, kept: NDArray[np.int64]) -> Observations:
         return no_observations()
     rows = np.isin(seen.track_ids, kept)
     instant = None if seen.instant_px is None else seen.instant_px[rows]
-    return Observations(seen.track_ids[rows], seen.pixels_px[rows], instant_px=instant)
+    return Observations(seen.track_ids[rows], seen.pixels_px[rows], instant_px=instant, readout_s=seen.readout_s)
