@@ -98,16 +98,12 @@ def test_how_long_rows_of_depth_take_is_learnt_beside_the_image(image_readout_s:
         noisy = rows_of_depth(depth_readout_s, twist) + rng.normal(0.0, 0.003, (CAMERA.height, CAMERA.width))
         frame = Frame(0, 0, (np.zeros((CAMERA.height, CAMERA.width), np.uint8),), None, noisy.astype(np.float32))
         pixels, xy = tracks(k)
-        # where the rows of the image see the wall, each at its time, and how far that is at the middle row's
+        # where the rows of the image see the wall, each at its time
         late = shutter.row(pixels) * image_readout_s
         true = np.array([
             plane_seen_from(se3_exp(s * twist)) @ [x, y, 1.0] for s, (x, y) in zip(late, xy, strict=True)
         ])  # fmt: skip
         read = lag.measure(sensor, frame, pixels, xy, true, twist, IDS)
-        true = np.array([
-            1.0 / (se3_exp(s * twist)[2] @ [x / rho, y / rho, 1.0 / rho, 1.0])
-            for s, (x, y), rho in zip(late, xy, true, strict=True)
-        ])  # fmt: skip
         lag.learn(read.rho - true, by_both(read.slope, pixels), read.sigma_rho, np.ones(len(xy), bool), 1.0 / 30.0)
     assert lag.rows_estimate_s == pytest.approx(depth_readout_s - image_readout_s, abs=0.003)
     assert lag.readout_s == pytest.approx(depth_readout_s, abs=0.003)

@@ -92,7 +92,7 @@ class DepthLag:
         self, sensor: DepthSensor, frame: Frame, pixels: Array, xy: Array, rho: Array, twist_per_s: Array,
         ids: NDArray[np.int64] | None, to_learn: bool = True,
     ) -> DepthReading:  # fmt: skip
-        """Return the depth of raw pixels [N, 2] at the time of the image's middle row.
+        """Return the depth of raw pixels [N, 2] at the time of the image.
 
         Args:
             sensor: reads the depth image.
@@ -104,16 +104,15 @@ class DepthLag:
             ids: tracks [N] that they belong to; None: of none.
             to_learn: say how it would change with the delay, too.
         """
-        row, moves = self._shutter.row(pixels), bool(twist_per_s.any())
-        late_s, seen = self._lag_s(frame) + self._rows_s * row, np.column_stack([xy, np.nan_to_num(rho)])
-        if frame.depth_m is not None and moves and late_s.any():
+        late_s = self._lag_s(frame) + self._rows_s * self._shutter.row(pixels)
+        if frame.depth_m is None or not twist_per_s.any():
+            return sensor.measure(frame, pixels, xy, rho, ids)
+        seen = np.column_stack([xy, np.nan_to_num(rho)])
+        if late_s.any():
             reading = self._read(sensor, frame, seen, twist_per_s, ids, late_s)
         else:
             reading = sensor.measure(frame, pixels, xy, rho, ids)
-        if moves and self._shutter.readout_s > 0.0:
-            at_row = np.column_stack([xy, reading.rho])
-            reading = replace(reading, rho=later(at_row, -self._shutter.readout_s * row, twist_per_s)[:, 2])
-        if frame.depth_m is None or not moves or (self._delay.is_told and self._rows.is_told) or not to_learn:
+        if (self._delay.is_told and self._rows.is_told) or not to_learn:
             return reading
         before, after = (self._read(sensor, frame, seen, twist_per_s, ids, late_s + s) for s in (-_STEP_S, _STEP_S))
         return replace(reading, by_delay=(after.rho - before.rho) / (2.0 * _STEP_S))
