@@ -302,7 +302,7 @@ class Front:
 
 
 def _late(track: TrackResult, since: Since, clock: CameraClock, mode: str) -> TrackResult:
-    """Return what vision says to a filter, whose times are the stamps': with their jitter, unless it has one."""
+    """Return vision's motion for a filter, whose times are the stamps': with their jitter, unless it has one."""
     return track if mode == "planar" else replace(track, vo=clock.jittered(track.vo, since.span, since.state))
 
 
