@@ -17,7 +17,7 @@ _STAMPS = 128  # whose unevenness counts
 _FEWEST, _EVERY = 8, 8  # of them before it is known, and between two looks
 _SHORT = 0.25  # quantile of intervals that no frame is missing in
 _OUTLIER = 6.0  # medians of their sizes, at which changes of intervals are cut: four sigmas
-_MOST_S = 0.01  # a larger jitter is another fault
+_LEAST_S, _MOST_S = 1e-4, 0.01  # a smaller jitter is as good as none, a larger one another fault
 _SLACK_RAD = 5e-3  # of a visual rotation from frame to frame, beyond which it is another fault
 
 
@@ -55,7 +55,8 @@ class StampJitter:
         uneven_s = steps_s - frames * np.median(steps_s / frames)
         changes_s = np.abs(np.diff(uneven_s))  # of three stamps, the middle one twice
         usual_s = np.minimum(changes_s, _OUTLIER * np.median(changes_s))
-        self._even_s = min(float(np.sqrt(np.mean(usual_s**2) / 6.0)), _MOST_S)
+        even_s = min(float(np.sqrt(np.mean(usual_s**2) / 6.0)), _MOST_S)
+        self._even_s = even_s if even_s > _LEAST_S else 0.0
 
     def see(self, vo: VoMeasurement, span: ImuSpan | None, gyro_bias_rad_s: Array) -> None:
         """Compare the turn since the last frame by vision with that of the samples [N, 3] between the two."""
