@@ -40,8 +40,8 @@ class StampJitter:
         if bound == 0.0:
             return 0.0
         total, weight, spread = self._sums
-        known = weight**2 / spread if spread > 0.0 else 0.0  # beside the bound, of which it may be any part
-        found = (bound / bound**2 + (total / weight * known if known else 0.0)) / (1.0 / bound**2 + known)
+        share = weight / spread if spread > 0.0 else 0.0
+        found = (1.0 / bound + total * share) / (1.0 / bound**2 + weight * share)  # a prior of bound +- bound
         return float(np.sqrt(np.clip(found, 0.0, bound)))
 
     def stamp(self, t_ns: int) -> None:
