@@ -11,6 +11,8 @@ from functools import lru_cache
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is imported
 
+os.environ.setdefault("VISLAM_COMPILING", "tests")  # each worker would compile ahead what the others do
+
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path

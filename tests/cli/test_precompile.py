@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from vislam.cli import precompile
-from vislam.cli.precompile import JOBS, Job
-from vislam.cli.verbs import VERBS
+from vislam.cli.verbs import VERBS, ahead
+from vislam.cli.verbs.ahead import JOBS, Job
 from worlds.compiled import optimised_afresh
 
 
@@ -31,7 +31,7 @@ def test_jobs_are_verbs() -> None:
 def test_a_job_compiles_once(kernels: Path, tmp_path_factory, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     shutil.copytree(optimised_afresh(tmp_path_factory) / "kernels", kernels, dirs_exist_ok=True)  # the rest is left
     before = len(list(kernels.rglob("*.nbc")))
-    monkeypatch.setattr(precompile, "JOBS", {"graphs": JOBS["graphs"]})
+    monkeypatch.setattr(ahead, "JOBS", {"graphs": JOBS["graphs"]})
     assert precompile.main([]) == 0
     assert "compiled in" in capsys.readouterr().err
     assert len(list(kernels.rglob("*.nbc"))) > max(before, 20)
@@ -41,7 +41,7 @@ def test_a_job_compiles_once(kernels: Path, tmp_path_factory, monkeypatch: pytes
 
 
 def test_a_job_that_failed_leaves_no_stamp_and_no_error(kernels: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(precompile, "JOBS", {"unknown to the child": Job(1, ())})
+    monkeypatch.setattr(ahead, "JOBS", {"unknown to the child": Job(1, ())})
     assert precompile.main([]) == 0
     assert "not all could be compiled ahead" in capsys.readouterr().err
     assert list(kernels.rglob("vislam-compiled-*")) == []
@@ -50,8 +50,8 @@ def test_a_job_that_failed_leaves_no_stamp_and_no_error(kernels: Path, monkeypat
 def test_a_stamp_holds_for_one_source_only(kernels: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = tmp_path / "package" / "kernel.py"
     source.parent.mkdir()
-    monkeypatch.setattr(precompile, "_PACKAGE", source.parent)
-    monkeypatch.setattr(precompile, "JOBS", {"cart": JOBS["cart"]})
+    monkeypatch.setattr(ahead, "_PACKAGE", source.parent)
+    monkeypatch.setattr(ahead, "JOBS", {"cart": JOBS["cart"]})
     compiled: list[str] = []
 
     @contextmanager
@@ -64,6 +64,15 @@ def test_a_stamp_holds_for_one_source_only(kernels: Path, monkeypatch: pytest.Mo
         source.write_text(text)
         assert precompile.main([]) == 0
         assert compiled == ["cart"] * count
+    source.write_text("a = 3\n")
+    assert not ahead.compile_ahead(["cart"])  # a verb compiles again what changed only, when it needs it
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "package"))
+    monkeypatch.setenv("VISLAM_COMPILING", "cart")
+    assert not ahead.compile_ahead(["cart"])  # within a job: it would never end
+    monkeypatch.delenv("VISLAM_COMPILING")
+    assert ahead.compile_ahead(["cart"])
+    assert not ahead.compile_ahead(["cart"])
+    assert compiled == ["cart"] * 3
 
 
 def test_a_child_says_nothing_but_names_of_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

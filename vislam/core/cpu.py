@@ -1,11 +1,12 @@
 """What this process has used so far: CPU time, compilation apart, and memory."""
 
+import ctypes
 import resource
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from numba.core import event
@@ -86,3 +87,9 @@ def peak_memory_mb() -> float:
     except (OSError, StopIteration):
         unit = 2**20 if sys.platform == "darwin" else 2**10
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def return_freed_memory() -> None:
+    """Hand what was freed back to the system: after much work in small pieces glibc keeps it; a no-op elsewhere."""
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)

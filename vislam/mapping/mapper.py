@@ -163,11 +163,12 @@ class Mapper:
 
     def cloud(self) -> Cloud:
         """Return all keyframes' points fused in the map frame, without what lies in free space and without outliers."""
-        config = self._config
+        config, view = self._config, self._extractor.view
         average, sparse_only = _averaged(
-            self._scans(), self._extractor.view, config.min_range_m, config.cloud_voxel_m, _MOST_CLOUD_POINTS
+            self._scans(), view, config.min_range_m, config.cloud_voxel_m, _MOST_CLOUD_POINTS
         )
         fused = average.cloud() if sparse_only else average.cloud(config.cloud_min_points, config.resolution_m)
+        del average  # it is many times as large
         # what later rays passed through was a moving thing or a false match
         fused = fused.select(self.occupancy.state_at(fused.points_m) != Occupancy.FREE)
         kept = without_outliers(fused, config.cloud_outlier_sigma, config.resolution_m)

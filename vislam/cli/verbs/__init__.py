@@ -18,15 +18,17 @@ class Verb:
 
     summary: str
     example: str
-    compile_s: int | None = None  # CPU seconds of compilation where no kernel is there yet; 0: none, None: not measured
+    compiles: tuple[str, ...] = ()  # jobs of `precompile` that are done first where they never were
     # of a verb that a package brings: takes the arguments and returns the exit code
     main: Callable[[list[str]], int] | None = None
 
 
+_DEMO = ("motion", "cart")
+_RUNS = (*_DEMO, "one camera")
 _VERBS = {
-    "demo": Verb("simulate a cart in a workshop and run everything on it", "vislam demo", 90),
+    "demo": Verb("simulate a cart in a workshop and run everything on it", "vislam demo", _DEMO),
     "run": Verb(
-        "run the pipeline on a recording; --resume RUN goes on with one", "vislam run tum:PATH --out runs/desk", 90
+        "run the pipeline on a recording; --resume RUN goes on with one", "vislam run tum:PATH --out runs/desk", _RUNS
     ),
     "simulate": Verb(
         "record a simulated world, or with --graph make a pose graph",
@@ -39,7 +41,7 @@ _VERBS = {
         "vislam doctor euroc:PATH; vislam doctor --i2c /dev/i2c-1 --camera 0",
     ),
     "optimize": Verb("estimate a run again in batch, or join several", "vislam optimize runs/desk"),
-    "posegraph": Verb("optimise a pose graph from a file", "vislam posegraph FILE.g2o --out results/graph", 15),
+    "posegraph": Verb("optimise a pose graph from a file", "vislam posegraph FILE.g2o --out results/graph"),
     "map": Verb(
         "make the maps of a run again, or say what an OctoMap file holds",
         "vislam map runs/desk --resolution-m 0.02 --products cloud octomap mesh",
@@ -59,6 +61,7 @@ _VERBS = {
     "live": Verb(
         "run the pipeline on live sensors and publish the pose; --resume RUN goes on with a run",
         "vislam live --source virtual-cart --out runs/cart",
+        (*_RUNS, "live"),
     ),
     "drive": Verb(
         "drive the virtual cart to goals, on the published pose and the map as it grows",
@@ -69,7 +72,7 @@ _VERBS = {
         "write the results of a run for ROS 2, Foxglove, COLMAP, nerfstudio and splats",
         "vislam export runs/desk --colmap desk",
     ),
-    "completion": Verb("print what makes bash or zsh complete all this", "vislam completion bash >> ~/.bashrc", 0),
+    "completion": Verb("print what makes bash or zsh complete all this", "vislam completion bash >> ~/.bashrc"),
 }
 
 VERBS = Kinds[Verb]("vislam.verbs", _VERBS, lacking("summary", "example", "main"))

@@ -3,12 +3,13 @@
 import re
 import sys
 from contextlib import redirect_stderr
-from functools import cache, partial
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import TypeVar
 
 from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.ahead import compile_ahead
 from vislam.cli.verbs.brief import Brief, brief_help
 from vislam.config.moved import refuse_moved
 from vislam.config.ranges import check_ranges
@@ -62,14 +63,14 @@ def _in_one_line(box: str, verb: str) -> str:
 
 @cache
 def _announce_compilation(verb: str) -> None:
-    """Say on stderr when this process begins to compile, and about how long that takes where it was measured."""
-    if (about_s := VERBS[verb.partition(" ")[0]].compile_s) != 0:
-        on_compilation(partial(_say_compiling, verb, about_s))
+    """When this process has compiled for a second: say so on stderr, and have all compiled that the verb needs."""
+    jobs = VERBS[verb.partition(" ")[0]].compiles
 
+    def ahead() -> None:
+        print("vislam: compiling for this processor, once ...", file=sys.stderr, flush=True)
+        compile_ahead(jobs, shown=False)
 
-def _say_compiling(verb: str, about_s: int | None) -> None:
-    how_long = "" if about_s is None else f"; all that {verb} needs takes about {about_s} s of CPU"
-    print(f"vislam: compiling for this processor, once{how_long} ...", file=sys.stderr, flush=True)
+    on_compilation(ahead)
 
 
 def take_option(arguments: list[str], name: str) -> str | None:

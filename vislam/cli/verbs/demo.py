@@ -4,6 +4,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.ahead import compile_ahead
 from vislam.cli.verbs.arguments import parse
 from vislam.cli.verbs.results import print_metrics
 from vislam.cli.verbs.run import RunOptions, run_options
@@ -31,10 +33,9 @@ OPTIONS = (DemoOptions,)
 def main(arguments: list[str]) -> int:
     """Simulate a world and run the pipeline on it."""
     options = parse(DemoOptions, arguments, "demo")
-    print(
-        f"vislam: simulating '{options.world}' and running the pipeline on it; about two minutes ...", file=sys.stderr
-    )
-    source = f"sim:{options.world},camera_hz={_CAMERA_HZ}"
+    compile_ahead(VERBS["demo"].compiles)
+    print(f"vislam: simulating '{options.world}' and running the pipeline on it; about a minute ...", file=sys.stderr)
+    source = f"sim:{options.world},camera_hz={_CAMERA_HZ},workers=2"
     run = RunOptions(source, options.out, Config(seed=options.seed), overwrite=True)
     print_metrics(run_options(run, ["vislam", "demo", *arguments]), run.out, as_json=False)
     return 0

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 from tyro.conf import UseAppendAction
 
+from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.ahead import compile_ahead
 from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.results import print_metrics
@@ -178,6 +180,7 @@ def main(arguments: list[str]) -> int:
     settings = settings if further.file is None else replace(settings, sensors=further)
     defaults = LiveOptions(out=tyro.MISSING, settings=settings, sensors=sensors)
     options = parse(LiveOptions, arguments, "live", defaults, BRIEF)
+    compile_ahead(VERBS["live"].compiles)  # while it runs, its processes would stop for it
     from vislam.runs.folder import map_choice, prepare
 
     base = map_choice(options.map, options.localize_only, options.settings)

@@ -22,13 +22,9 @@ def progress_bar(name: str, unit: str = "frames") -> Iterator[Callable[[int, int
 
     It takes what is done, of how much, 0 where that is unknown, and a note.
     """
-
-    def share(done: int, total: int) -> str:
-        return f"{done}/{total} {unit}" if total else f"{done} {unit}"
-
     if not sys.stderr.isatty():
-        say = _now_and_then()
-        yield lambda done, total, note: say(f"{name}: {share(done, total)}  {note}".rstrip())
+        with progress_lines(name, unit) as say:
+            yield say
         return
     columns = (
         TextColumn(name),
@@ -39,8 +35,19 @@ def progress_bar(name: str, unit: str = "frames") -> Iterator[Callable[[int, int
     with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=None, note="", share="")
         yield lambda done, total, note: bar.update(
-            task, completed=done, total=total or None, note=note, share=share(done, total)
+            task, completed=done, total=total or None, note=note, share=_share(done, total, unit)
         )
+
+
+@contextmanager
+def progress_lines(name: str, unit: str = "frames") -> Iterator[Callable[[int, int, str], None]]:
+    """Show a line on stderr now and then; it takes what `progress_bar` takes."""
+    say = _now_and_then()
+    yield lambda done, total, note: say(f"{name}: {_share(done, total, unit)}  {note}".rstrip())
+
+
+def _share(done: int, total: int, unit: str) -> str:
+    return f"{done}/{total} {unit}" if total else f"{done} {unit}"
 
 
 @contextmanager

@@ -20,6 +20,7 @@ _KEY_HALF = 1 << (_KEY_BITS - 1)
 _COLUMNS = 8  # weighted sums of position and colour, sum of weights, number of points
 _FAINT_SHARE = 0.15  # of the usual weight of a voxel in its cell; what has less is the blur around a surface
 _NEIGHBOURS = 12  # of a point, whose mean distance shows whether it is alone
+_AT_ONCE = 1 << 16  # points that are averaged at a time, which bounds memory
 _COARSER = 1.5  # a cloud that gets too large gets voxels larger by this
 
 
@@ -139,10 +140,11 @@ class VoxelAverage:
         need = self._count + extra
         if need > len(self._keys):
             grown = max(need, 2 * len(self._keys))
-            self._keys = np.resize(self._keys, grown)
-            self._sums = np.concatenate([self._sums, np.empty((grown - len(self._sums), _COLUMNS))])
+            keys, sums = np.empty(grown, np.int64), np.empty((grown, _COLUMNS))  # memory that none uses is not there
+            keys[: self._count], sums[: self._count] = self._keys[: self._count], self._sums[: self._count]
+            self._keys, self._sums = keys, sums
         if 2 * need > len(self._table):
-            size = 1 << int(np.ceil(np.log2(4 * need)))
+            size = 1 << int(np.ceil(np.log2(2 * need)))
             self._table, self._rows = np.full(size, -1, np.int64), np.zeros(size, np.int32)
             _rehash(self._table, self._rows, self._keys, self._count)
 
@@ -151,14 +153,18 @@ class VoxelAverage:
 
         With `cell_m`, only where a cell of that size holds at least `min_points`, and without its faintest voxels.
         """
-        sums = self._sums[: self._count]
+        sums, chosen = self._sums[: self._count], np.arange(self._count)
         if cell_m > 0.0 and len(sums):
             cell_of = cells_of(sums[:, :3] / sums[:, 6:7], cell_m)
             usual = np.bincount(cell_of, weights=sums[:, 6]) / np.bincount(cell_of)
             enough = np.bincount(cell_of, weights=sums[:, 7]) >= min_points
-            sums = sums[enough[cell_of] & (sums[:, 6] >= _FAINT_SHARE * usual[cell_of])]
-        means = sums[:, :6] / sums[:, 6:7]
-        return Cloud(means[:, :3].astype(np.float32), np.clip(np.round(means[:, 3:]), 0, 255).astype(np.uint8))
+            chosen = np.flatnonzero(enough[cell_of] & (sums[:, 6] >= _FAINT_SHARE * usual[cell_of]))
+        points, colors = np.empty((len(chosen), 3), np.float32), np.empty((len(chosen), 3), np.uint8)
+        for first in range(0, len(chosen), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            means = sums[chosen[part], :6] / sums[chosen[part], 6:7]
+            points[part], colors[part] = means[:, :3], np.clip(np.round(means[:, 3:]), 0, 255)
+        return Cloud(points, colors)
 
 
 def cells_of(points_m: NDArray[np.floating], cell_m: float) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.core.cpu import return_freed_memory
 from vislam.core.jit import njit
 from vislam.core.messages import Array, ImageU8
 from vislam.sim.scene.names import labels_of
@@ -183,7 +184,9 @@ def _levels(image: ImageU8) -> list[ImageU8]:
 def painted(build: Callable[[np.random.Generator], SceneBuilder], seed: int) -> Scene:
     """Return a world, laid out by `build` and painted; takes seconds, and is the same each time."""
     layout, paint = np.random.SeedSequence(seed).spawn(2)
-    return bake(build(np.random.default_rng(layout)), paint)
+    scene = bake(build(np.random.default_rng(layout)), paint)
+    return_freed_memory()  # of painting: more than the scene itself
+    return scene
 
 
 def bake(builder: SceneBuilder, seed: np.random.SeedSequence, threads: int = 2) -> Scene:
