@@ -1,4 +1,4 @@
-"""`python -m vislam.cli.precompile`, of which `./run setup` consists: compiles what verbs need, as `verbs.ahead` says.
+"""`python -m vislam.cli.precompile`, of which `./run setup` consists: compiles what verbs need by `verbs.ahead`.
 
 Given a job's name, it is one of the processes that do so.
 """
