@@ -8,7 +8,7 @@ import sys
 import tempfile
 
 from vislam.cli import run_verb
-from vislam.cli.verbs.ahead import JOBS, Job, compile_changed
+from vislam.cli.verbs.ahead import JOBS, WITHIN, Job, compile_changed
 from vislam.core.compiling import on_each_kernel
 
 
@@ -22,6 +22,7 @@ def main(arguments: list[str]) -> int:
 
 def _do(job: Job) -> int:
     """Run the verbs of a job; a line on stdout for each kernel that is compiled, and nothing else."""
+    os.environ[WITHIN] = "a job"
     out = os.fdopen(os.dup(1), "w", buffering=1)
     with tempfile.TemporaryDirectory(prefix="vislam-precompile-") as folder:
         os.chdir(folder)

@@ -24,7 +24,7 @@ from vislam.cli.verbs.terminal import progress_bar, progress_lines
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _AT_ONCE = 2
-_WITHIN = "VISLAM_COMPILING"  # in the environment of what must not compile ahead
+WITHIN = "VISLAM_COMPILING"  # in the environment of what must not compile ahead
 _LOOPS = (  # so that a short run looks for loops, and trains its words
     "--loop.odometry-skip-keyframes=0", "--loop.appearance-skip-keyframes=0", "--loop.appearance-skip-s=0",
     "--loop.first-training=2", "--loop.min-training-lag=1", "--loop.min-inliers=6",
@@ -78,7 +78,7 @@ def compile_ahead(jobs: Sequence[str], shown: bool = True) -> bool:
     `shown` False the terminal has a bar already, and gets a line now and then.
     """
     waiting = [name for name in jobs if not _stamps(name)]
-    if not waiting or _WITHIN in os.environ:
+    if not waiting or WITHIN in os.environ:
         return False
     _compile(waiting, _stamp(), shown)
     return True
@@ -89,6 +89,7 @@ def _compile(jobs: Sequence[str], stamp: str, shown: bool = True) -> None:
     waiting = {name: JOBS[name] for name in jobs}
     total = sum(job.kernels for job in waiting.values())
     begun_s, done, lock = time.monotonic(), 0, Lock()
+    running: list[subprocess.Popen[str]] = []
     title = "compiling for this processor, once"
     progress = progress_bar(title, "kernels") if shown else progress_lines(title, "kernels")
     with progress as bar, ThreadPoolExecutor(_AT_ONCE) as threads:
@@ -97,9 +98,9 @@ def _compile(jobs: Sequence[str], stamp: str, shown: bool = True) -> None:
             nonlocal done
             counted = 0
             with subprocess.Popen(
-                [sys.executable, "-m", "vislam.cli.precompile", name], stdout=subprocess.PIPE, text=True,
-                env=os.environ | {_WITHIN: name},
-            ) as process:  # fmt: skip
+                [sys.executable, "-m", "vislam.cli.precompile", name], stdout=subprocess.PIPE, text=True
+            ) as process:
+                running.append(process)
                 assert process.stdout is not None
                 for line in process.stdout:
                     with lock:
@@ -112,7 +113,12 @@ def _compile(jobs: Sequence[str], stamp: str, shown: bool = True) -> None:
                 _leave(name, stamp)
             return process.returncode
 
-        codes = list(threads.map(work, waiting))
+        try:
+            codes = list(threads.map(work, waiting))
+        except BaseException:  # an interrupt: what is compiled by now is kept
+            for process in running:
+                process.terminate()
+            raise
     if any(codes):
         print("vislam: not all could be compiled ahead; verbs compile the rest when they need it", file=sys.stderr)
     else:
