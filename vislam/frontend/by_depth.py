@@ -1,8 +1,8 @@
 """Frames that vision cannot place, by their depth image: against the last keyframes', from where motion predicts them.
 
-Dark rooms and bare walls leave a depth camera what it measures itself. What the shape of the room does not tell (a wall
-slides, a corridor in one direction) is kept from the prediction, with its growing uncertainty: where that becomes too
-large the frame is lost as before.
+In the dark and before bare walls a depth camera still measures depth. Directions that the shape of the room does not
+constrain (along a wall or a corridor) are kept from the prediction, with its growing uncertainty: where that becomes
+too large, the frame is lost as without depth.
 """
 
 from dataclasses import dataclass, replace
@@ -23,9 +23,9 @@ _DEPTH_ALONE_OVERLAP = 0.4  # of its surface that falls on the last keyframes'; 
 # between the exposures of depth and colour of a frame: TUM's pairs are up to 16 ms apart, and depth is stamped late
 DEPTH_APART_S = 0.03
 _TURN_WALK, _SPEED_WALK = 2.0, 0.7  # rad/s and m/s per root of a second: 6 rad/s^2, 2 m/s^2 of a hand over 0.1 s
-_TURN_SIGMA, _SPEED_SIGMA = 0.3, 0.2  # rad/s and m/s, of what the last two frames that vision placed say
+_TURN_SIGMA, _SPEED_SIGMA = 0.3, 0.2  # rad/s and m/s, of the rates from the last two frames that vision placed
 _CHI2 = 22.5  # six degrees of freedom, exceeded once in 1000: depth and prediction contradict each other
-_GYRO_SIGMA_RAD, _BIAS_RAD_S = 0.002, 0.2  # of a turn by the gyroscope, and of its bias where nobody knows it
+_GYRO_SIGMA_RAD, _BIAS_RAD_S = 0.002, 0.2  # of a turn by the gyroscope, and of its bias where that is unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class Moved:
     dt_s: float
     key_twist_per_s: Array  # [6] velocity of the camera at the keyframe
     depth_delay_s: float  # by which depth is taken later than its stamps say
-    gyro_sigma_rad_s: float | None  # of its bias, where a gyroscope told the turn; infinite: not known
+    gyro_sigma_rad_s: float | None  # of its bias, where a gyroscope measured the turn; infinite: unknown
 
 
 class ByDepth:
@@ -118,7 +118,7 @@ class ByDepth:
         F[:6, :6] = se3_adjoint(np.asarray(invert(moved.T_guess) @ moved.T_before))
         F[:6, 6:] = dt * np.eye(6)
         walk = np.diag(np.repeat([_TURN_WALK**2, _SPEED_WALK**2], 3))
-        if moved.gyro_sigma_rad_s is not None:  # tells the turn itself: what was known of the rate is not asked
+        if moved.gyro_sigma_rad_s is not None:  # a gyroscope measures the turn: the rate known before is not used
             F[:3, 6:9] = 0.0
             bias_rad_s = min(moved.gyro_sigma_rad_s, _BIAS_RAD_S)
             walk[:3, :3] = 0.0

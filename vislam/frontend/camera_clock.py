@@ -22,7 +22,7 @@ _EVERY_FRAMES = 5  # between estimates: they change slowly, and each costs a mil
 _SIGNIFICANT = 3.0  # sigmas of the estimate
 _WIDER = 3.0  # sigmas of the offset by which the gyroscope's word on rotation is widened
 _MOST_BACK = 0.5  # of a frame interval, by which stamps may step back at once
-_FASTEST_M_S = 1.0  # assumed where nothing tells the speed
+_FASTEST_M_S = 1.0  # assumed where the speed is unknown
 
 
 class CameraClock:
@@ -53,7 +53,7 @@ class CameraClock:
 
     @property
     def estimate(self) -> TimeOffsetEstimate:
-        """Offset, gyro bias and misalignment of the axes as rotations tell them."""
+        """Offset, gyro bias and misalignment of the axes, estimated from rotations."""
         return self._offset.estimate
 
     @property
@@ -110,7 +110,7 @@ class CameraClock:
             return vo
         rate = 1.0 if span is None else float(np.linalg.norm(span.gyro_rad_s, axis=1).max())
         speed = _FASTEST_M_S if state is None else float(np.linalg.norm(state.velocity_world_m_s))
-        along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way says nothing then
+        along = speed * shift_s if vo.has_scale else 1.0  # a direction over a short way is unknown then
         extra = np.diag(np.repeat([(rate * shift_s) ** 2, along**2], 3))
         return replace(vo, covariance=vo.covariance + extra)
 

@@ -1,8 +1,8 @@
 """When the rows and the depth of a frame were taken: the shutter's readout and the lag of depth, both learnt.
 
 Structured light and colour have shutters of their own. On fr1_desk depth is stamped 19 ms before to 19 ms after its
-image, and at 100 deg/s that is 2 degrees, 16 px. Stamps tell what they tell; what they leave, a driver's delay, is the
-same for all images and learnt from how depth misfits the landmarks, along the gradient of the depth image. So is by
+image, and at 100 deg/s that is 2 degrees, 16 px. Stamps have that; what they lack, a driver's delay, is the same for
+all images and learnt from how depth misfits the landmarks, along the gradient of the depth image. So is by
 how much longer its rows take than the image's: the first and last rows of Kinect's depth are 30 ms apart (Ringaby and
 Forssen, "Scan rectification for structured light range sensors with rolling shutters", ICCV 2011), others take all at
 once.
@@ -37,12 +37,12 @@ _LEAST_SHARE = 0.1  # ... nor is one known that is a small part of the time over
 # for the derivative by the delay: some pixels, for depth has noise from one to the next, and to both sides, for that
 # noise must not be the same as that of what is measured
 _STEP_S = 0.01
-_MOST_ALIKE = 1e6  # condition of what tells delay and rows apart; rows are counted from -0.5 to 0.5
-_LEAST_TRACKS = 10  # that tell of delay and rows in one frame
+_MOST_ALIKE = 1e6  # condition number of the information on delay and rows; rows are counted from -0.5 to 0.5
+_LEAST_TRACKS = 10  # with information on delay and rows in one frame
 _LEAST_READOUT = 0.005  # s: a shorter one counts as none, for it is the sum of two that were learnt ...
 _KNOWN_S = 0.002  # ... and depth is moved by it only once it is known so well
 _ONE_FRAME = (1.0 / _FRAME_SIGMA_S**2,) * 2  # what an earlier run's delay and rows count for at least
-_GATE = 3.0  # standard deviations of a depth that tells of the delay
+_GATE = 3.0  # standard deviations of a depth that the delay is learnt from
 
 
 class DepthLag:
@@ -51,32 +51,32 @@ class DepthLag:
     def __init__(self, camera: Camera, shutter: Shutter, delay_s: float | None, readout_s: float | None) -> None:
         """Take the shutter of the image, and delay and readout of depth in seconds, None to estimate them."""
         self._camera, self._shutter = camera, shutter
-        self._delay, self._told_readout_s = _Learnt(delay_s), readout_s
+        self._delay, self._given_readout_s = _Learnt(delay_s), readout_s
         self._rows = _Learnt(None if readout_s is None else 0.0)  # by how much longer rows take than the image's
         self._interval_s = 0.0
 
     @property
     def delay_s(self) -> float:
         """The delay that is applied, in seconds."""
-        return self._delay.estimate_s if self._delay.is_told else self._applied(self._delay.estimate_s, _LEAST)
+        return self._delay.estimate_s if self._delay.is_given else self._applied(self._delay.estimate_s, _LEAST)
 
     @property
     def readout_s(self) -> float:
         """From the first to the last row of depth, as it is applied, in seconds."""
-        if self._told_readout_s is not None:
-            return self._told_readout_s
+        if self._given_readout_s is not None:
+            return self._given_readout_s
         both_s = self._shutter.readout_s + self._rows.estimate_s
         return max(self._applied(both_s, _LEAST_READOUT), 0.0) if self._rows.sigma_s < _KNOWN_S else 0.0
 
     @property
     def delay_estimate_s(self) -> float | None:
-        """The delay that was learnt, None: it was told."""
-        return None if self._delay.is_told else self._delay.estimate_s
+        """The delay that was learnt; None: it was given."""
+        return None if self._delay.is_given else self._delay.estimate_s
 
     @property
     def rows_estimate_s(self) -> float | None:
-        """By how much longer rows of depth take than the image's, as far as was learnt; None: the readout was told."""
-        return None if self._rows.is_told else self._rows.estimate_s
+        """By how much longer rows of depth take than the image's, as far as learnt; None: the readout was given."""
+        return None if self._rows.is_given else self._rows.estimate_s
 
     def start_at(self, delay_s: float | None, rows_s: float | None, information: Sequence[float] = _ONE_FRAME) -> None:
         """Take what an earlier run had learned, with its `information` [2] in 1/s^2, to be learned further."""
@@ -112,7 +112,7 @@ class DepthLag:
             reading = self._read(sensor, frame, seen, twist_per_s, ids, late_s)
         else:
             reading = sensor.measure(frame, pixels, xy, rho, ids)
-        if (self._delay.is_told and self._rows.is_told) or not to_learn:
+        if (self._delay.is_given and self._rows.is_given) or not to_learn:
             return reading
         before, after = (self._read(sensor, frame, seen, twist_per_s, ids, late_s + s) for s in (-_STEP_S, _STEP_S))
         return replace(reading, by_delay=(after.rho - before.rho) / (2.0 * _STEP_S))
@@ -170,8 +170,8 @@ class DepthLag:
     @property
     def _rows_s(self) -> float:
         """By how much longer the rows of depth take than the image's, as it is applied."""
-        if self._told_readout_s is not None:
-            return self._told_readout_s - self._shutter.readout_s
+        if self._given_readout_s is not None:
+            return self._given_readout_s - self._shutter.readout_s
         return self._applied(self._rows.estimate_s, _LEAST)
 
     def _applied(self, seconds: float, least_s: float) -> float:
@@ -198,11 +198,11 @@ class DepthLag:
 
 
 class _Learnt:
-    """A time that frame after frame tells a little of."""
+    """A time that is given, or estimated from a little information in each frame."""
 
-    def __init__(self, told_s: float | None) -> None:
-        self.is_told = told_s is not None
-        self.estimate_s = told_s or 0.0
+    def __init__(self, given_s: float | None) -> None:
+        self.is_given = given_s is not None
+        self.estimate_s = given_s or 0.0
         self.information = 1.0 / _SIGMA_S**2
 
     @property
@@ -210,11 +210,11 @@ class _Learnt:
         return float(self.information**-0.5)
 
     def start_at(self, seconds: float | None, information: float) -> None:
-        if seconds is not None and not self.is_told:
+        if seconds is not None and not self.is_given:
             self.estimate_s, self.information = min(max(seconds, -_MAX_S), _MAX_S), information
 
     def take(self, seconds: float, information: float) -> None:
-        if self.is_told:
+        if self.is_given:
             return
         trusted = min(_TRUST * information, 1.0 / _FRAME_SIGMA_S**2)
         self.information = min(self.information, _MEMORY_FRAMES / _FRAME_SIGMA_S**2) + trusted
@@ -232,7 +232,7 @@ class Exposures:
     """
 
     def __init__(self, camera: Camera, config: FrontEndConfig) -> None:
-        """Begin with what the configuration tells, or with nothing."""
+        """Begin with the times that the configuration gives; the others are learnt from zero."""
         self.shutter = Shutter(camera, config.readout_s)
         self.lag = DepthLag(camera, self.shutter, config.depth_delay_s, config.depth_readout_s)
         self.key_twist_per_s: Array = np.zeros(6)

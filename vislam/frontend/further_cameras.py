@@ -1,7 +1,7 @@
 """Cameras beyond the first, or the first pair: each follows corners of its own, which filter and window tie together.
 
-No overlap is needed. A front end places the body by what it looks through; the motion that it measures, else that of
-the filter, says where tracks of the other cameras are searched for and which of them move by themselves.
+No overlap is needed. A front end places the body by its own camera or pair; from the motion that it measures, else that
+of the filter, follow where tracks of the other cameras are searched for and which of them move by themselves.
 """
 
 from dataclasses import replace

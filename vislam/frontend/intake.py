@@ -11,7 +11,7 @@ from vislam.core.messages import Frame, ImageU8, Observations, chosen
 from vislam.core.streams import Happening, Repeats, StreamEvent, StreamJudge
 
 _DESCRIPTOR_BYTES = 32
-_EVERY_PX = 8  # depth is looked for at one pixel in so many, each way
+_EVERY_PX = 8  # depth is looked for in every eighth row and column
 _OLD_NS = 500_000_000  # that a depth image stays the same, at most: such sensors give five a second at least
 _HOLE_S = 0.25  # without a frame, at least
 _STUCK_ROWS = 2  # images equal to the one before, from which on they show nothing: one may be a hiccup

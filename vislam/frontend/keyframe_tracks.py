@@ -60,7 +60,7 @@ class KeyframeTracks:
     # -- from frame to frame -----------------------------------------------------------------------------------------
 
     def predicted(self, dt_s: float, imu: ImuSpan | None) -> Array:
-        """Return T_key_cam [4, 4] where the camera will be after `dt_s`; `imu` tells its turn."""
+        """Return the T_key_cam [4, 4] expected after `dt_s`; its rotation is from `imu`, where that is given."""
         return self.T_key_cam @ self.predictor.predict(dt_s, imu)
 
     def follow(self, frame: Frame, T_guess: Array, dt_s: float) -> Array:
@@ -77,7 +77,7 @@ class KeyframeTracks:
         return self.exposures.lag.measure(self.view.depth, frame, pixels, seen, rho, twist_per_s, ids, to_learn)
 
     def moved(self, T_key_cam: Array, dt_s: float, was_lost: bool) -> None:
-        """Take where a frame was placed; its motion tells a velocity unless the one before `was_lost`."""
+        """Take where a frame was placed; the velocity follows from its motion unless the one before `was_lost`."""
         T_before, self.T_key_cam = self.T_key_cam, T_key_cam
         if not was_lost:
             self.predictor.observe(invert(T_before) @ T_key_cam, dt_s)

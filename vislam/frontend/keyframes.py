@@ -17,7 +17,7 @@ PATIENCE_S = 0.4  # so long a lost keyframe is searched for before a new one sta
 _KEYFRAME_ROTATION_DEG = 15.0  # patches turn with the camera and stop matching
 # fraction of the keyframe's tracks that are still followed, and the same where a frame without depth would follow it
 _KEYFRAME_MIN_ALIVE, _KEYFRAME_MIN_ALIVE_UNFIT = 0.45, 0.2
-_RESTART_KEYFRAMES = 8  # after a loss, so many come as soon as they may: chances to recognise the place
+_RESTART_KEYFRAMES = 8  # that come as soon as they may after a loss: chances to recognise the place
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class Exposed:
 def make_keyframe(
     keyframe_id: int, frame: Frame, camera: Camera, T_body_cam: Array, features: int, exposed: Exposed | None
 ) -> Keyframe:
-    """Describe a frame for loop closing; None: nothing tells depths.
+    """Describe a frame for loop closing; `exposed` None: there are no depths.
 
     A frame that brings its tracks brings their descriptors too, or has nothing to recognise it by.
     """
@@ -108,7 +108,7 @@ class KeyframeLife:
     """The keyframe that frames are placed by: its number, when the next one is due, and when it is given up."""
 
     def __init__(self, config: FrontEndConfig, has_scale: bool) -> None:
-        """Begin without a keyframe; `has_scale` says of all measurements whether they are in metres."""
+        """Begin without a keyframe; `has_scale`: measurements are in metres."""
         self.keyframe: Keyframe | None = None
         self._config = config
         self._has_scale = has_scale
@@ -158,7 +158,7 @@ class KeyframeLife:
     def install(
         self, frame: Frame, camera: Camera, T_body_cam: Array, tracks: int, exposed: Exposed | None = None
     ) -> Keyframe:
-        """Make a frame with so many tracks the keyframe; see make_keyframe."""
+        """Make a frame with that number of tracks the keyframe; see make_keyframe."""
         new_id = self._first_id if self.keyframe is None else self.keyframe.id + 1
         features = self._config.described_features
         self.keyframe = make_keyframe(new_id, frame, camera, T_body_cam, features, exposed)

@@ -1,8 +1,8 @@
 """The surfaces of the last keyframes, and new ones fitted to them: odometry against a small map instead of one frame.
 
-What tracks tell of the way since the last keyframe errs anew with each one. Surfaces that several of the last keyframes
-saw are met again (Newcombe et al., "KinectFusion", ISMAR 2011), so errors do not add up while the same is in view, and
-bare walls count as well as textured ones. See docs/decisions/013-surfaces-of-the-last-keyframes.md.
+Motions that tracks give since the last keyframe have a new error with each keyframe. Surfaces that several of the last
+keyframes saw are fitted again (Newcombe et al., "KinectFusion", ISMAR 2011), so errors do not add up while these are in
+view, and bare walls count as well as textured ones. See docs/decisions/013-surfaces-of-the-last-keyframes.md.
 """
 
 from __future__ import annotations

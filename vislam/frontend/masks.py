@@ -114,7 +114,7 @@ class Masks:
 
 
 def mask_warnings(counters: Mapping[str, int]) -> list[str]:
-    """Return what `Masks.problems` says, for a report."""
+    """Return one line for each kind of problem in `Masks.problems`, for a report."""
     return [f"{count} {kind}; log.txt names the first" for kind, count in counters.items()]
 
 

@@ -147,7 +147,7 @@ class MetricFrontEnd:
     def _settle(
         self, frame: Frame, keyframe: Keyframe, attempt: Attempt, T_guess: Array, dt_s: float, bias: float | None
     ) -> TrackResult:
-        """Take the motion over, or go by depth alone, or lose the keyframe; `bias` as `Moved.gyro_sigma_rad_s`."""
+        """Take the motion over, or use depth alone, or lose the keyframe; `bias` as `Moved.gyro_sigma_rad_s`."""
         tracks = self._tracks
         if attempt.failure:
             exposures = tracks.exposures

@@ -36,8 +36,8 @@ from vislam.vision.two_view import (
 
 # of rotation by the gyro since a keyframe, beside its bias: scale, time offset
 _MONO_GYRO_SIGMA_RAD = 0.002
-_MONO_MIN_PARALLAX_PX = 3.0  # less, and the direction of motion drowns in noise: only rotation is told
-_MIN_GIVEN = 8  # in place of both numbers for tracks given from elsewhere: few, but somebody chose them
+_MONO_MIN_PARALLAX_PX = 3.0  # less, and the direction of motion drowns in noise: only rotation is measured
+_MIN_GIVEN = 8  # in place of both numbers for tracks given from elsewhere: few, but selected by their source
 _RANSAC_PX = 1.5
 _RANSAC_BELOW = 0.9  # of the tracks agree: the start may have led to the second solution that a flat scene has
 _TURN_EXPLAINS = 0.9  # of the tracks agree with a rotation: no need for a translation
@@ -87,7 +87,7 @@ class _Limits:
 
 
 class MonoFrontEnd:
-    """Frame-to-keyframe odometry from epipolar geometry; below a few pixels of parallax only the rotation is told.
+    """Frame-to-keyframe odometry from epipolar geometry; below a few pixels of parallax it measures only rotation.
 
     The translation column of its measurements is the unit direction in which cam0 (not the body's origin) moved, in
     body axes of the keyframe: without scale, the lever arm between the two cannot be taken out here.
@@ -296,7 +296,7 @@ class MonoFrontEnd:
         return TrackResult(vo, observations, None, motion.parallax_px, weak)
 
     def _weakness(self, motion: _Motion) -> str:
-        # of tracks that somebody chose, as many times the least as of our own
+        # of given tracks, as many times the least as of our own
         enough = DEGRADED_INLIERS * self._limits.min_inliers // self._config.min_inliers
         return weakness(motion.followed, motion.inliers, enough)
 
@@ -309,7 +309,7 @@ class MonoFrontEnd:
     # -- keyframes ---------------------------------------------------------------------------------------------------
 
     def _start(self, frame: Frame, why: str) -> TrackResult:
-        """Begin anew with this frame as keyframe, if there is enough to see in it."""
+        """Begin again with this frame as keyframe, if there is enough to see in it."""
         self._tracker.forget()
         count = self._tracker.begin(frame, np.zeros(0, dtype=np.bool_), np.empty((0, 2)))
         self._last_px = self._tracker.pixels.copy()

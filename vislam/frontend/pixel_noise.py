@@ -1,9 +1,9 @@
 """How much tracks scatter in this run, as the distances from their epipolar lines show it.
 
 Depth errs along the epipolar line, so across it nothing is left but the noise of the pixels themselves, whatever is
-known of the landmarks; and the same holds with one camera. Tracks that went astray are trimmed by what the others show,
-not by what was told. Frames are averaged in the logarithm, over some seconds, so that one blurred frame does not make
-the run noisy.
+known of the landmarks; and the same holds with one camera. Tracks that went astray are trimmed by the spread of the
+others, not by the stated noise. Frames are averaged in the logarithm, over some seconds, so that one blurred frame does
+not make the run noisy.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ _MEDIAN_ABS = 0.6745  # of a normal distribution, in standard deviations
 _TRIM = 2.0  # standard deviations
 _TRIMMED_RMS = 0.8796  # of a standard normal distribution within the trim
 _STEPS = 4
-_MIN_TRACKS = 30  # of a frame that says something
-_MIN_FRAMES = 10  # before what was measured goes before what was told
+_MIN_TRACKS = 30  # of a frame that is used
+_MIN_FRAMES = 10  # before the measured noise takes the place of the stated one
 _MEMORY_FRAMES = 200  # over which is averaged: blur and light change within seconds
 _MIN_PX = 0.02  # of a frame: simulated pixels without any noise
 _PARAMETERS = 5  # of the motion that the same tracks were fitted with
-_USUAL_PX = 0.4  # of keyframes in sharp images (EuRoC MH_01), for which what estimators are told was found to hold
+_USUAL_PX = 0.4  # of keyframes in sharp images (EuRoC MH_01), for which estimators' stated noise was found to hold
 
 
 def _spread_px(lengths: Array) -> float:
@@ -44,9 +44,9 @@ def _spread_px(lengths: Array) -> float:
 class PixelNoise:
     """Learns the standard deviation of a track's pixel, in x and in y, from frame to frame."""
 
-    def __init__(self, told_px: float) -> None:
-        """Start from the `told_px` of the configuration."""
-        self._told_px = told_px
+    def __init__(self, stated_px: float) -> None:
+        """Start from the `stated_px` of the configuration."""
+        self._stated_px = stated_px
         self._log_px = 0.0
         self._frames = 0
         self._frame_px: float | None = None
@@ -67,8 +67,8 @@ class PixelNoise:
 
     @property
     def sigma_px(self) -> float:
-        """The standard deviation: measured, or as told while too little was seen."""
-        return float(np.exp(self._log_px)) if self.is_learnt else self._told_px
+        """The standard deviation: measured, or as stated while too little was seen."""
+        return float(np.exp(self._log_px)) if self.is_learnt else self._stated_px
 
     @property
     def over_usual(self) -> float:
@@ -88,9 +88,9 @@ class PixelNoise:
     def learn(self, distances: Array, camera: Camera, xy: Array, ends: float = 1.0) -> None:
         """Take a frame's distances [N] of tracks at `xy` [N, 2] from their epipolar lines; NaN where there is none.
 
-        Distances and places are on z = 1; the camera's lens says how many pixels that is there. `ends` are the
-        variances of such a distance in those of one pixel: 1 where the place in the keyframe is the track by
-        definition, 2 where it is as noisy as the one in the frame.
+        Distances and places are on z = 1; the camera's lens converts them to pixels there. `ends` is the variance of
+        such a distance in units of one pixel's variance: 1 where the place in the keyframe is the track by definition,
+        2 where it is as noisy as the one in the frame.
         """
         self._frame_px = None
         seen = np.isfinite(distances)
@@ -108,7 +108,7 @@ class PixelNoise:
 
 @dataclass(slots=True)
 class NoiseUsed:
-    """What a run showed of its tracks, and by how much more than told estimators were to take them for noisy."""
+    """The noise of a run's tracks as measured, and the factor on the stated noise that estimators were to use."""
 
     measured_px: float = float("nan")  # scatter, as the newest frame knows it
     factors: float = 0.0  # sum over frames, see `Observations.noise`

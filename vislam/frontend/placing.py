@@ -36,9 +36,9 @@ _BLIND_SIGMA = 0.02  # of the inverse depth that the first keyframe is lent by a
 class BlindKeyframe:
     """Follows the turn of a camera whose depth sensor has not begun, frame by frame.
 
-    Two views could tell the direction of motion, too. In the first half second of fr1_desk, whose shutter rolls, they
-    were 3 to 5 degrees off in every second frame and sure of it; a turn alone is 3 degrees off after 5 cm, and what it
-    leaves unexplained says so.
+    Two views determine the direction of motion, too. In the first half second of fr1_desk, whose shutter rolls, they
+    were 3 to 5 degrees off in every second frame, with small sigmas; a turn alone is 3 degrees off after 5 cm, and its
+    residuals show that.
     """
 
     def __init__(self, config: FrontEndConfig, view: View, pixels: Array) -> None:
@@ -54,7 +54,7 @@ class BlindKeyframe:
         return self._camera.project(rays @ T_last_now[:3, :3])
 
     def turn(self, frame: Frame, keyframe: Keyframe, pixels: Array, T_guess: Array) -> tuple[Array, TrackResult] | None:
-        """Return the camera's turn since the keyframe [4, 4] and what it tells; None where too few tracks are left.
+        """Return the camera's turn since the keyframe [4, 4] and its result; None where too few tracks are left.
 
         The covariance has what parallax hides behind a turn.
 

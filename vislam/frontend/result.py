@@ -15,7 +15,7 @@ from vislam.core.memory import Learned
 from vislam.core.messages import Array, Frame, ImuSpan, Keyframe, Observations, Tracking, VoMeasurement
 from vislam.vision.two_view import TwoViewEstimate
 
-_NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement that says nothing
+_NO_KNOWLEDGE = 1e6  # variance in rad^2 and m^2 of a measurement without information
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class TrackResult:
     keyframe: Keyframe | None
     median_parallax_px: float  # since the keyframe that `vo` refers to, rotation taken out; 0 when nothing was followed
     reason: str  # why tracking is not ok, or why the frame became a keyframe; empty otherwise
-    sigma_px: float = float("nan")  # of a track's pixel, as this run showed it up to now; told until enough was seen
+    sigma_px: float = float("nan")  # of a track's pixel, as measured in this run; as stated until enough was seen
     by_depth: bool = False  # vision failed, and the depth image alone places the frame
     outliers: float = 0.0  # share of the followed tracks that do not agree on a motion, before a filter has its say
     others: int = 0  # tracks that agree on another motion than the frame's: something moves by itself
@@ -145,7 +145,7 @@ def unscaled_motion(
 
 
 def too_few(frame: Frame, corners: int) -> str:
-    """Return why a frame with so many corners or given tracks cannot start a keyframe."""
+    """Return why a frame with this number of corners or given tracks cannot start a keyframe."""
     if frame.tracks is not None:
         return f"only {corners} points were given"
     return f"only {corners} corners in an image of mean grey {frame.images[0].mean():.0f}"

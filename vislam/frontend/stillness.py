@@ -2,7 +2,7 @@
 
 From one frame to the next, slow motion shifts corners by less than their noise. Over half a second it does not: each
 track's pixels are fitted by a straight line in time, and what the lines have in common (shift, turn, zoom) and how far
-they differ beyond noise (parallax) tell motion from rest. Noise is that of the pixels about their lines.
+they differ beyond noise (parallax) distinguish motion from rest. Noise is that of the pixels about their lines.
 
 A rest that lasts is judged by where its tracks were all the time, too: their mean since it began is known far better
 than a line through half a second. So it ends with a creep that is too slow for the line, and not with a noisy frame.
@@ -37,9 +37,9 @@ class Stillness:
     Attributes:
         resting: whether a rest goes on, up to the newest frame; for those who already know their state. It bears a
             frame that noise moves a little beyond the limit, and ends when the tracks have left their places.
-        moved_px: common motion over the window, median over the tracks; NaN where it could not be told or is far.
-        parallax_px: motion in which tracks differ, beyond noise; NaN where it could not be told.
-        noise_px: standard deviation of one coordinate of a pixel about its line; NaN where it could not be told.
+        moved_px: common motion over the window, median over the tracks; NaN where it is unknown or far.
+        parallax_px: motion in which tracks differ, beyond noise; NaN where it is unknown.
+        noise_px: standard deviation of one coordinate of a pixel about its line; NaN where it is unknown.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Stillness:
     def add(self, t_ns: int, seen: Observations) -> bool:
         """Take a frame and return whether the image stood still up to it.
 
-        False also where it cannot be told: fewer than three frames, or fewer than ten tracks in most of them.
+        False also where that is unknown: fewer than three frames, or fewer than ten tracks in most of them.
         """
         frames = self._frames
         if frames and not 0 < t_ns - frames[-1][0] <= _MAX_INTERVAL_NS:
@@ -73,7 +73,7 @@ class Stillness:
         return times_limit < 1.0
 
     def _times_limit(self, t_ns: int) -> float:
-        """Return the largest motion over the window in units of its limit; infinite where it cannot be told."""
+        """Return the largest motion over the window in units of its limit; infinite where it is unknown."""
         if len(self._frames) < MIN_FRAMES:
             return np.inf
         if self._is_far():
@@ -138,7 +138,7 @@ class Stillness:
         return times_limit
 
     def _since_rest_began(self) -> float:
-        """Return how far the tracks are from their places in units of the limit; 0 where it cannot be told."""
+        """Return how far the tracks are from their places in units of the limit; 0 where it is unknown."""
         ids, pixels = self._pixels()
         places, count = self._places.of(ids)
         now = pixels[-MIN_FRAMES:]

@@ -2,7 +2,7 @@
 
 A camera whose stamps are late or early sees the rotations that the gyroscope measures shifted in time. Rotation between
 a keyframe and a frame, by vision and by gyroscope, is compared over a sliding window; the difference is linear in time
-offset, gyro bias and a small misalignment of the axes, for which one least-squares problem is solved, integrated anew
+offset, gyro bias and a small misalignment of the axes, for which one least-squares problem is solved, integrated again
 around every solution. A camera with a clock of its own (`init.clock_drift`) adds the rate by which that is off: its
 offset is then that of the newest frame, and never final. Neither gravity nor scale is needed. The idea is that of Li
 and Mourikis, "Online temporal calibration for camera-IMU systems", IJRR 2014.
@@ -28,10 +28,10 @@ _NS = 1_000_000_000
 _WINDOW_S = 10.0  # of frames that are looked at: longer than a hand takes to turn this way and that
 _SLACK_S = 0.1  # more inertial data than the frames span, so that they can be shifted
 _MIN_FRAMES = 15  # fewer are no statistics
-_SIGMA_RAD = 1e-3  # nominal, of a visual rotation; residuals tell the real one
-_MIN_RATIO = 0.05  # of real to nominal variance: better than 0.2 mrad nobody is
+_SIGMA_RAD = 1e-3  # nominal, of a visual rotation; the real one is estimated from residuals
+_MIN_RATIO = 0.05  # of real to nominal variance: no visual rotation is better than 0.2 mrad
 _GYRO_BIAS_SIGMA = 0.5  # rad/s, prior: wide enough for any
-_TOLD_SIGMA_S = 1e-3  # what others find is believed no further: their models have errors in common with ours
+_GIVEN_SIGMA_S = 1e-3  # an offset found elsewhere is trusted no further: other models share errors with this one
 TURN_SIGMA = np.deg2rad(1.0)  # prior of the misalignment: a calibration is hardly worse
 _CAUCHY = 3.0  # standard deviations
 _ROUNDS = 5
@@ -186,8 +186,8 @@ class TimeOffset:
         """Take an offset that was found by other means, with its sigma."""
         if not self.settled and sigma_s < self._sigma_now_s:
             t_ns = self.estimate.t_ns if self._last_t_ns is None else self._last_t_ns
-            told_s = max(sigma_s, _TOLD_SIGMA_S)
-            self._prior = replace(self._prior, offset_s=offset_s, sigma_s=told_s, t_ns=t_ns)
+            given_s = max(sigma_s, _GIVEN_SIGMA_S)
+            self._prior = replace(self._prior, offset_s=offset_s, sigma_s=given_s, t_ns=t_ns)
             self.estimate = replace(self.estimate, offset_s=offset_s, sigma_s=sigma_s, t_ns=t_ns)
 
 

@@ -20,11 +20,11 @@ from vislam.vision.landmarks import move
 
 # of the spread of 1/z within 8x8 px: what a wrong registration by some pixels costs
 _DEPTH_SPREAD = 0.5
-_DEPTH_EDGE_RHO = 0.06  # 1/m: a larger spread is an edge, its depth belongs to nobody
+_DEPTH_EDGE_RHO = 0.06  # 1/m: a larger spread is an edge, where depth belongs to neither side
 _STEREO_WINDOW_PX = 15  # smaller than in time: depth edges hurt, blur is the same in both images
 _STEREO_LEVELS = 3  # pyramid levels above the image
 EPIPOLAR_GATE_PX = 1.5  # distance from the epipolar line that calibration and noise explain
-_REACH_PX = 4  # half the side of the neighbourhood that says how much a wrong registration would matter
+_REACH_PX = 4  # half the side of the neighbourhood in which the effect of a wrong registration is measured
 _START_DISPARITIES = (8.0, 25.0, 60.0)  # px; with the reach of Lucas-Kanade they cover 0 to about 90
 
 
@@ -263,14 +263,14 @@ class View:
         """Return what another camera would see of tracks [N] that this one sees at `xy` [N, 2], to `gate_px`.
 
         The depth is that of landmarks `means` [N, 3] of the same instant, with covariances [N, 3, 3]; tracks whose
-        place it does not tell so well are left out.
+        pixel it predicts with a larger sigma are left out.
         """
         covariance = np.zeros_like(covariances)
         covariance[:, 2, 2] = covariances[:, 2, 2]
         points, covariance = self.carry(np.column_stack([xy, means[:, 2]]), covariance, other)
         pixels = other.camera.project(np.column_stack([points[:, :2], np.ones(len(points))]))
-        told = other.camera.contains(pixels) & (other.camera.fx * spread(covariance) < gate_px)
-        return Observations(ids[told], pixels[told], instant_px=pixels[told])
+        known = other.camera.contains(pixels) & (other.camera.fx * spread(covariance) < gate_px)
+        return Observations(ids[known], pixels[known], instant_px=pixels[known])
 
 
 def stereo_views(rig: Rig, config: FrontEndConfig) -> tuple[View, View]:

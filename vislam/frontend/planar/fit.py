@@ -268,7 +268,7 @@ def joint_fit(
 
 
 def no_fit(motion: Array, count: int, failure: str) -> Fit:
-    """Return the answer for so many points that say nothing."""
+    """Return the result for `count` points that no motion could be fitted to."""
     covariance: Array = np.full((_UNKNOWNS, _UNKNOWNS), np.nan)
     return Fit(motion, np.zeros(4), 0.0, covariance, np.zeros(count, dtype=np.bool_), np.inf, failure)
 
@@ -359,7 +359,7 @@ def scale_sigma(fit: Fit, tilt_covariance: Array) -> float:
     if length < 1e-3 or not np.isfinite(fit.covariance).all():
         return 0.0
     information = np.linalg.inv(fit.covariance + 1e-18 * np.eye(_UNKNOWNS))
-    free = np.array([0, 1, 2, 5, 6, 7])  # what is fitted anew where the common tilt [3:5] is another one
+    free = np.array([0, 1, 2, 5, 6, 7])  # unknowns that are fitted again where the common tilt [3:5] is another one
     by_tilt = np.linalg.solve(information[np.ix_(free, free)], -information[free, 3:5])
     along = fit.motion[1:] @ by_tilt[1:3] / length**2
     return float(np.sqrt(along @ tilt_covariance @ along))

@@ -2,7 +2,7 @@
 
 Level frame: its origin is cam0, z is up from the floor, x is the body's x along the floor. The rotation that takes
 camera axes there is that of the mount, turned a little by what the cart's springs, its load and an inexact calibration
-do. What changes quickly the gyroscope tells; the mean the floor itself shows, by the way it flows by.
+do. The gyroscope measures what changes quickly; the optical flow of the floor itself shows the mean.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _small(tilt: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turn:
-    """What the gyroscope says of the time between two frames."""
+    """The gyroscope's measurement of the turn between two frames."""
 
     yaw_rad: float  # about the floor's normal
     known: bool  # bias and all

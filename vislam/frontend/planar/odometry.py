@@ -1,7 +1,7 @@
 """Visual odometry of a cart by the floor: one camera at a known height gives motion in metres.
 
 Corners are followed from the keyframe; those that lie on the floor fit a motion in the plane (`fit`), with a
-tilt that gyroscope and floor tell (`floor`). The rest, on walls and furniture, is triangulated along the way and
+tilt from gyroscope and floor (`floor`). The rest, on walls and furniture, is triangulated along the way and
 kept for those who want tracks (`tracks`). It never fails silently: too little texture, points of the floor in
 too few parts of the image, residuals that nothing explains, or a yaw that the gyroscope contradicts make a frame
 degraded or lost (`place`).
@@ -243,7 +243,7 @@ class PlanarFrontEnd:
     # -- keyframes ---------------------------------------------------------------------------------------------------
 
     def _start(self, frame: Frame, why: str) -> TrackResult:
-        """Begin anew with this frame as keyframe, if there is enough of the floor to see in it."""
+        """Begin again with this frame as keyframe, if there is enough of the floor to see in it."""
         count = self._tracks.begin(frame, self._tilt.R_level_cam)
         lack = self._lack(frame)
         if lack:

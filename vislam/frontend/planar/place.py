@@ -40,7 +40,7 @@ class Course:
         self.begin()
 
     def begin(self, at_rest: bool = False) -> None:
-        """Begin anew at a keyframe; `at_rest` also forgets the velocity."""
+        """Begin again at a keyframe; `at_rest` also forgets the velocity."""
         self.motion: Array = np.zeros(3)
         self.yaw_rad, self.yaw_sigma_rad = 0.0, 0.0
         if at_rest:
@@ -48,11 +48,11 @@ class Course:
 
     @property
     def knows_yaw(self) -> bool:
-        """Whether the gyroscope has told the whole yaw since the keyframe."""
+        """Whether the gyroscope has measured the whole yaw since the keyframe."""
         return bool(np.isfinite(self.yaw_sigma_rad))
 
     def predicted(self, turn: Turn, dt_s: float, gyro_sigma_rad_s: float) -> Array:
-        """Return the motion [3] expected `dt_s` after the newest frame, and add up what the gyroscope says of yaw."""
+        """Return the motion [3] expected `dt_s` after the newest frame, and add up the yaw that the gyroscope gives."""
         if turn.known:
             self.yaw_rad += turn.yaw_rad
             self.yaw_sigma_rad += gyro_sigma_rad_s * dt_s
@@ -69,7 +69,7 @@ class Course:
         self.motion, self._is_lost = found.copy(), False
 
     def lose(self, guess: Array) -> None:
-        """Go on where the cart should be by now, for the frame did not tell."""
+        """Go on from the pose that the cart is expected to have, as the frame gave none."""
         self.motion, self._is_lost = guess, True
 
 

@@ -61,7 +61,7 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InertialPath:
-    """The nodes as inertial data alone tells them, in body axes of the first node, but for what is unknown.
+    """The nodes by inertial data alone, in body axes of the first node, as functions of what is unknown.
 
     Position of node i: `known[i] + unknown[i] @ (first velocity, gravity, accelerometer bias)`.
     """
@@ -283,7 +283,7 @@ def _eliminated(
 
     A noisy bearing b makes `I - b b^T` see a little of the distance itself, `bias` of its square, which is twice the
     variance of b, and least squares would shrink the world to make that small; it is taken off. Points of which the
-    bearings tell the distance by less than `least` of their weight are left out.
+    bearings constrain the distance with less than `least` of their weight are left out.
     """
     count = len(begin) - 1
     H, g = np.zeros((9, 9)), np.zeros(9)

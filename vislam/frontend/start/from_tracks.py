@@ -107,8 +107,7 @@ class StartFromTracks:
     def _solved(self, sighted: Sighted, tracks: Tracks, path: InertialPath) -> tuple[Start, BundleSolution]:
         """Return the window's least squares and the closed form that led to it.
 
-        The closed form over points fails where few points last; the shape that epipolar constraints tell is then the
-        start.
+        The closed form over points fails where few points last; the shape by epipolar constraints is then the start.
         """
         window, rig = sighted.window, Rig((self._camera,), (self._T_body_cam,))
         start = solve_start(window, path, tracks)

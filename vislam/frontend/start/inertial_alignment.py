@@ -108,7 +108,7 @@ class Alignment:
 def solve_gyro_bias(window: Window) -> Array:
     """Return the gyro bias [3] in rad/s that makes inertial rotations between neighbours agree with visual ones."""
     bias = np.zeros(3)
-    for _ in range(2):  # integrated anew once: the first guess, zero, can be far off
+    for _ in range(2):  # integrated again once: the first guess, zero, can be far off
         pieces = [preintegrate(span, bias) for span in window.spans]
         for _ in range(2):
             A, b = np.eye(3) * 1e-9, np.zeros(3)

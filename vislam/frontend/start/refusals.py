@@ -75,7 +75,7 @@ class Refusals:
 
     def start(self, start: Start) -> Initialisation | None:
         """Refuse where the linear solution, gravity left free, is far from what gravity can be."""
-        # in a short window this norm errs by more than its sigma says: twice the room
+        # in a short window this norm errs by more than its sigma: twice the room
         allowed = 2.0 * (GRAVITY_TOLERANCE_M_S2 + AGREE_SIGMAS * start.free_norm_sigma_m_s2)
         is_foreign = abs(start.free_norm_m_s2 - self._gravity) > allowed
         return self.contradiction(start.free_norm_m_s2) if is_foreign else None

@@ -103,7 +103,7 @@ class FrameWindow:
         del self.entries[:keep]
 
     def restamp(self, shift_ns: int, cut: Callable[[int, int], ImuSpan | None]) -> None:
-        """Shift all times and cut the spans anew; at the ends, where inertial data do not reach, they are moved."""
+        """Shift all times and cut the spans again; at the ends, where inertial data do not reach, they are moved."""
         moved: list[Entry] = []
         for entry in self.entries:
             vo, span = replace(entry.vo, t_ns=entry.t_ns + shift_ns), entry.span
