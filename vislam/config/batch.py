@@ -10,7 +10,7 @@ from vislam.config.ranges import Count, Many, NonNegative, Positive, Probability
 class BatchConfig:
     """Batch optimisation of a finished run: visual-inertial bundle adjustment over all keyframes."""
 
-    rounds: Count = 5  # of optimising, then judging tracks, loops, noise and readout anew; the last changes 3 % or less
+    rounds: Count = 5  # of optimising, then judging tracks, loops, noise, readout again; the last changes 3 % or less
     huber_k: Positive = 2.0  # standard deviations, in later rounds
     vision_inflation: Positive = 2.0  # on sigmas against the IMU: errors of a track and of calibration go together
     covariances: bool = True  # of all states; costs about as much as a round
@@ -24,16 +24,16 @@ class PoseGraphConfig:
         "auto"  # auto: the one of lowest cost; all of them where it ends above what noise allows
     )
     equations: Literal["auto", "cholesky", "gradients"] = "auto"  # conjugate gradients where a factor would be large
-    # which edges that do not join successive ids may be rejected, by what; auto tries several, judges, and says why
+    # by which cost edges that do not join successive ids may be rejected; auto tries several and reports its choice
     robust: Literal["none", "auto", "cauchy", "geman-mcclure", "dcs", "gnc"] = "none"
-    rescale_noise: bool = False  # variances of each kind of edge multiplied by what its residuals show, solved anew
+    rescale_noise: bool = False  # variances of each kind of edge multiplied by what its residuals show, solved again
     iterations: Count = 100  # most of them; 3 to 8 as a rule
     tolerance: Annotated[float, Range(1e-15, 1.0)] = 1e-9  # of the cost: the decrease still to come at which to end
     inlier_probability: Probability = 0.999  # chi-square beyond which a loop is false; 1 of 1000 true ones goes with it
     noise: bool = True  # report what residuals show of the stated noise: takes about as long as finding the optimum
     certify: bool = True  # examine whether the optimum is the global one: takes two to five times as long as finding it
     covariances: bool = False  # write those of all poses: in space 300 bytes each
-    # what an iSAM file in the plane states: square roots of information, or covariances; auto tells and says so
+    # what an iSAM file in the plane states: square roots of information, or covariances; auto finds and reports which
     isam_noise: Literal["auto", "root", "covariance"] = "auto"
     repair_information: bool = False  # take the nearest positive definite matrix for what is not; else it is refused
 
@@ -48,5 +48,5 @@ class GraphWorldConfig:
     translation_sigma_m: NonNegative = 0.05  # per axis; 5 % of a step, poor odometry
     anisotropy: Positive = 1.0  # forward, and about z, the sigmas are this many times as large
     outlier_fraction: Share = 0.0  # of all loops
-    alias_group: Count = 1  # so many false loops in a row agree, as a corridor that looks like another one gives them
+    alias_group: Count = 1  # successive false loops that agree, as from a corridor that looks like another one
     seed: Seed = 0  # same seed, same graph

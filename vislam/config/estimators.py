@@ -76,17 +76,17 @@ class GraphConfig:
     covariance_ratio_max: Positive = 1e6  # eigenvalue ratio of any factor; gtsam 4.3.0 throws above 1e7
 
     vo_inflation: Positive = 2.0  # mono, on sigma: what residuals miss, as neighbours err alike
-    vo_degraded_inflation: Positive = 3.0  # further, when the front end says degraded
+    vo_degraded_inflation: Positive = 3.0  # further, when the front end reports a degraded frame
     vo_floor_deg: NonNegative = 0.05  # no camera and calibration is better than this between keyframes
     vo_floor_m: NonNegative = 0.001
-    scale_sigma: NonNegative = 0.0  # as in `ekf`; tells how sure the states are and moves nothing
+    scale_sigma: NonNegative = 0.0  # as in `ekf`; enters the covariances of states and moves nothing
     # on sigma of a window's edges; consecutive ones share errors, here they are summed
     window_inflation: Positive = 2.0
     window_floor_deg: NonNegative = 0.01  # no calibration lets a window know more
     window_floor_m: NonNegative = 0.0005
     # a provisional edge that moved by more of its sigma is replaced at once ...
     window_refresh_sigma: NonNegative = 0.3
-    window_refresh_max: Whole = 3  # ... up to so many per keyframe, those that moved most
+    window_refresh_max: Whole = 3  # ... at most this number per keyframe, those that moved most
     gravity_every: Count = 10  # keyframes between tilt factors; errors of nearer ones are the same accelerometer bias
     edges_share_scale: bool = False  # of a window: set by the run, for one camera whose scale is the IMU's
     tilt_floor_deg: NonNegative = 0.1  # an accelerometer's misalignment, which the window does not estimate
@@ -97,12 +97,12 @@ class GraphConfig:
     loop_floor_m: NonNegative = 0.005
     loop_floor_deg: NonNegative = 0.2
     pending_max: Whole = 200  # pending loops kept; the oldest leave first
-    # nats that a keyframe's loops must tell the graph to get factors, where loops are many
+    # nats of information that a keyframe's loops must add to the graph to get factors, where loops are many
     loop_gain_min: NonNegative = 0.5
-    # loops in the graph are many; then a loop to a keyframe that is tied to an older one, or ...
+    # loops in the graph, from which on they are many: those of a keyframe are then tied to one anchor, and ...
     anchor_after: Whole = 20
-    freeze_keyframes: Count = 40  # where loops are many, so many keyframes leave the solver together, once they are ...
-    freeze_after: Whole = 200  # ... so many keyframes old, and stand from then on beside one that it keeps
+    freeze_keyframes: Count = 40  # ... leave the solver together, once they are ...
+    freeze_after: Whole = 200  # ... this number of keyframes old; they are then held relative to one that it keeps
 
     # the link to a keyframe with which a new submap begins: nothing is known, but equations stay solvable.
     # 100 times weaker than a loop, no more than 4096 times weaker than an edge, beyond which gtsam 4.3.0 throws

@@ -26,13 +26,13 @@ class PlanarConfig:
 
     height_m: NonNegative | None = None  # of cam0 above the floor; known, it makes `auto` choose this front end
     height_sigma_m: NonNegative = 0.002  # a tape, or a measured drive of 3 m: its share of H is an error of scale
-    tilt_deg: Finite | None = None  # of the optical axis below the horizon; None: body z is up, cam0 as the rig says
+    tilt_deg: Finite | None = None  # of the optical axis below the horizon; None: body z is up, cam0 as in the rig
     roll_deg: Finite = 0.0  # about the optical axis, clockwise in the image; counts with tilt_deg only
     tilt_sigma_deg: NonNegative = 0.5  # of both, before the floor itself corrects them; 0.5 deg is 2.5 % of scale
     method: Literal["joint", "split"] = "joint"  # split: Karpov 2026, rotation from above the horizon
-    vibration_deg: NonNegative = 0.2  # of a driving cart's tilt, where no gyro tells it
+    vibration_deg: NonNegative = 0.2  # of a driving cart's tilt, where no gyro measures it
     vibration_known_deg: NonNegative = 0.03  # what the gyro leaves of it
-    vibration_s: NonNegative = 3.0  # so long the gyro's word on tilt counts: springs bring a cart back, bias would not
+    vibration_s: NonNegative = 3.0  # for which tilt by the gyro is used: springs bring a cart back, bias would not
     tilt_walk_deg: NonNegative = 0.01  # per root of a second, of the mean tilt: load and tyres
     heave_m: NonNegative = 0.002  # of the camera's height between two frames
     # in place of `ekf.vo_inflation`: tilt, springs and stamps are in the covariance already

@@ -19,7 +19,7 @@ class VibrationConfig:
 
 @dataclass(frozen=True, slots=True)
 class ImuConfig:
-    """Inertial noise; None keeps what the recording's own sensor file says."""
+    """Inertial noise; None keeps that of the recording's own sensor file."""
 
     enabled: bool = True  # off: vision alone, as if the recording had no IMU
     gyroscope_noise_density: NonNegative | None = None  # rad/s/sqrt(Hz)

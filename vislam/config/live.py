@@ -18,7 +18,7 @@ class LiveConfig:
     mavlink: str | None = None  # udp:HOST:PORT that gets ODOMETRY; needs pymavlink
     bridge_rate_hz: Positive = 50.0  # of both at most: what autopilots want; control near by takes the datagrams
     base_offset_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # what a controller steers, in body axes
-    # without a correction for so long it is dead reckoning; a lost frame says so at once
+    # without a correction for this time it is dead reckoning; a lost frame is reported at once
     vision_timeout_s: NonNegative = 0.3
     drift_sigma_m: NonNegative = 0.3  # position sigma gained since vision was lost, above which the pose is invalid
     velocity_sigma_m_s: NonNegative = 0.5  # above which it is invalid
@@ -34,7 +34,7 @@ class ViewConfig:
     """The Rerun recording of a run."""
 
     enabled: bool = True  # off: no run.rrd
-    every_frames: Count = 2  # images are logged for one frame in so many: halves the cost, and nobody sees it
+    every_frames: Count = 2  # from one frame with logged images to the next: halves the cost, and looks the same
     image_width_px: Count = 320  # a JPEG of this width costs 1.5 ms and 9 kB; VGA costs three times that
     cloud_points: Count = 4000  # per keyframe, from depth; sparse features are all kept
     map_every_s: Positive = 5.0  # octree and grid are written again so often at most
@@ -47,6 +47,6 @@ class VerdictConfig:
 
     # of each test to pass where nothing is wrong: some 15 tests, 1 doubt in 60 sound runs
     probability: Probability = 0.999
-    # of the camera on the body as told: Kalibr is good to 0.1, a printed mount to 1
+    # of the camera on the body as calibrated: Kalibr is good to 0.1, a printed mount to 1
     rotation_sigma_deg: NonNegative = 0.5
     accel_bias_sigma_m_s2: NonNegative = 0.2  # as `init.accel_bias_sigma_m_s2`: of a calibrated cheap accelerometer

@@ -27,7 +27,7 @@ class LoopConfig:
     min_rigid: Whole = 5
     chance_matched_share: Share = 0.015  # of the features that chance matches; views without depth need clearly more
     tags: Literal["off", "16h5", "25h9", "36h10", "36h11"] = "36h11"  # AprilTag family
-    tags_every: Count = 4  # so many keyframes, until a tag was seen: 3 to 5 ms each; then, or with a size, all of them
+    tags_every: Count = 4  # keyframes, until a tag was seen: 3 to 5 ms each; then, or with a size, all are searched
     tag_size_m: NonNegative | None = None  # side of the black square; known, a tag alone gives a relative pose
     retrieved: Count = 10  # keyframes asked of the index and matched, 0.4 ms each
     island_gap: Whole = 3  # ids in one island differ by at most this
@@ -38,7 +38,7 @@ class LoopConfig:
     first_training: Whole = 20  # keyframes; trained on fewer, words find less than those that come along
     training_growth: Positive = 1.25  # keyframes, until trained again: words find less what they were not trained on
     min_training_lag: Whole = 2  # keyframes that come during a training, at least ...
-    catch_up_keyframes: Whole = 8  # of those, so many are indexed with each new one once it is done: 0.4 ms each
+    catch_up_keyframes: Whole = 8  # of those, indexed with each new one once it is done: 0.4 ms each
     training_descriptors: Many = 500_000  # at most: bounds a training, in the background, to 2 s
     vocabulary_branching: Few = 10  # children of a node
     vocabulary_depth: Few = 6  # levels at most; as many as leave each word five descriptors
@@ -61,7 +61,7 @@ class LoopTruthConfig:
     near_m: NonNegative = 1.0  # a keyframe that was proposed is truly near below this, ...
     near_deg: NonNegative = 40.0  # ... turned by less than this, and where the views overlap by min_overlap
     min_apart_s: NonNegative = 10.0  # a pair is a loop when it is this far apart in time ...
-    min_apart_keyframes: Whole = 30  # ... or by so many keyframes; nearer pairs are tied by odometry anyway
+    min_apart_keyframes: Whole = 30  # ... or by this number of keyframes; nearer pairs are tied by odometry anyway
     gross_m: NonNegative = 0.5  # an edge whose translation is off by more would ruin a map
     gross_deg: NonNegative = 10.0  # or whose rotation is
     max_truth_gap_s: NonNegative = 0.3  # true poses are interpolated over less: a few millimetres by hand or on wheels

@@ -51,8 +51,8 @@ class MonoDepthConfig:
     search_sigmas: NonNegative = 3.0  # of inverse depth, to both sides
     uniqueness: Share = 0.8  # most that the best match's cost may be of the next one's; 1 asks for nothing
     sigma_px: Positive = 1.0  # of a match along the epipolar line
-    # of a match, where noise and gradient tell the rest of its error (SVO, REMODE): what poses and lens leave; None: a
-    # match is `sigma_px` off whatever its texture
+    # of a match, from poses and lens, beside the error by noise and gradient (SVO, REMODE); None: `sigma_px` is all of
+    # it, whatever the texture
     model_sigma_px: NonNegative | None = None
     # a reference patch whose corners turn and zoom move by more than this is warped into the image; None: never
     warp_px: NonNegative | None = 0.3
@@ -60,12 +60,12 @@ class MonoDepthConfig:
     max_sigma_ratio: NonNegative = 4.0  # of a measurement over what is known; beyond, it is not worth a search
     converged: Share = 0.02  # sigma of inverse depth over its mean; on TUM fr1_desk 0.01 finds a quarter less
     min_matches: Whole = 3
-    max_misses: Whole = 6  # more than matches by so many: hidden, moving or too alike, and not searched any more
+    max_misses: Whole = 6  # more than matches: hidden, moving or too alike, and not searched any more
     min_depth_m: NonNegative = 0.3  # nearer, frames share too little
     max_depth_m: NonNegative = 20.0
     # an image turned by more is turned back, which leaves out what does not fit; without warped patches 1.5 is good
     derotate_deg: NonNegative = 180.0
-    handover_sigma: NonNegative = 0.05  # of inverse depth that the next keyframe takes over; it measures anew
+    handover_sigma: NonNegative = 0.05  # of inverse depth that the next keyframe takes over; it measures again
     keyframes: Few = 3  # later ones that feed a keyframe before the next is begun; more parallax, fewer depth images
     max_range_m: NonNegative = 8.0  # farther points only clear the way
     threads: Few = 2  # the result does not depend on it
@@ -110,7 +110,7 @@ class MapConfig:
     rebuild_keyframes_per_call: Whole = 8  # that cast rays again in one call while a correction is followed; 3 ms each
     cloud_voxel_m: Cell = 0.015  # one averaged point per voxel in cloud.ply
     cloud_min_points: Whole = 4  # depth pixels that must lie in an octree voxel for its points to stay in the cloud
-    # statistical outlier removal: mean distance to neighbours may exceed the average by so many standard deviations
+    # statistical outlier removal: standard deviations by which a mean distance to neighbours may exceed the average
     cloud_outlier_sigma: NonNegative = 2.5
     # radius of moving least squares, three voxels or more; 0: points as measured
     cloud_smooth_m: Annotated[float, Range(0.0, 10.0)] = 0.0

@@ -6,7 +6,7 @@ from typing import Any
 from vislam.core.errors import UsageError
 
 PROFILES: Mapping[str, Mapping[str, Any]] = {
-    # four cores of a small computer, or one of a desktop; docs/config.md says what it costs in accuracy
+    # four cores of a small computer, or one of a desktop; docs/config.md has its cost in accuracy
     "pi": {
         "frontend": {"max_tracks": 200, "described_features": 500},
         "ekf": {"tight_max_tracks": 30},

@@ -1,6 +1,6 @@
-"""What values a number among the settings may have: said in its type, checked for a whole tree of settings at once.
+"""Ranges of the settings that are numbers: stated in their types, checked for a whole tree of settings at once.
 
-`sigma_px: Positive = 1.0` is a float for whoever uses it, and a wish outside of its range a usage error.
+`sigma_px: Positive = 1.0` is a float in code that uses it, and a value outside of its range is a usage error.
 """
 
 import dataclasses

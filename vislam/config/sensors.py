@@ -49,7 +49,7 @@ class Gy85Config:
     self_test: bool = True  # at the start, 1 s, standing still; docs/sensors.md
     supply_v: Positive = 3.3  # of the accelerometer: its self-test limits grow with it
     reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away; one costs up to 0.1 s
-    silent_s: NonNegative = 0.1  # without a sample, a chip is set up again, and the source says that it is missing
+    silent_s: NonNegative = 0.1  # without a sample, a chip is set up again, and the source reports it as missing
     max_temperature_change_c: NonNegative = 10.0  # since the biases were taken; an ITG3205 then drifts by up to 1 deg/s
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
@@ -70,7 +70,7 @@ class BoardConfig:
     mag_rate_hz: Positive = 50.0  # how often it is asked
     mag_range_ga: Positive = 1.9  # or the next wider one that the chip has; the earth has 0.25 to 0.65, motors add
     reopen_s: NonNegative = 0.5  # between attempts to reach a chip or bus that went away
-    silent_s: NonNegative = 0.1  # without a sample, the chip is set up again, and the source says that it is missing
+    silent_s: NonNegative = 0.1  # without a sample, the chip is set up again, and the source reports it as missing
     max_temperature_change_c: NonNegative = 10.0  # since the biases were taken
     calibration: SensorCalibration = field(default_factory=SensorCalibration)
 
@@ -79,7 +79,7 @@ class BoardConfig:
 class BridgeClockConfig:
     """The line that turns the serial bridge's clock into the host's."""
 
-    bin_s: Positive = 0.1  # the least delayed arrival of each counts; the line is laid anew so often
+    bin_s: Positive = 0.1  # the least delayed arrival of each counts; the line is fitted again after each
     settle_s: NonNegative = 0.5  # no sample is passed before the rate has been seen for so long
 
 
@@ -91,7 +91,7 @@ class SerialConfig:
     baud: Many = 500_000  # exact on a 16 MHz AVR, which misses 230400 by 3.5 %; 400 Hz take a quarter of it
     filter_s: NonNegative = 0.0033  # delay of the gyro's 98 Hz filter, and half a millisecond of its sampling
     missing_s: NonNegative = 0.1  # without a sample for so long, the IMU is missing: 40 samples at 400 Hz
-    # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it anew
+    # an Uno's boot loader runs 2 s after the port is opened; later without a sample, open it again
     start_s: NonNegative = 4.0
     reopen_s: NonNegative = 0.5  # between attempts to open a port that is not there
     calibrated_at_c: Finite | None = None  # temperature of the gyro when its biases were taken
@@ -105,7 +105,7 @@ class LibraryCameraConfig:
     """What all cameras have in common; docs/sensors.md."""
 
     device: str = ""  # a serial number, an id; empty: the first that is found
-    width_px: Count = 640  # enough for 400 tracks; or the nearest size that the camera has: it is told
+    width_px: Count = 640  # enough for 400 tracks; or the nearest size that the camera has, which is reported
     height_px: Count = 480
     rate_hz: Positive = 30.0
     # 1 m/s at 1 m blurs by 5 px; None leaves it to the camera, and lights flicker then
@@ -144,7 +144,7 @@ class PicamConfig(LibraryCameraConfig):
 class DepthCameraConfig(LibraryCameraConfig):
     """A camera with a stereo pair, or colour and depth, and its maker's calibration; where it sits on the body."""
 
-    # place of its first camera (left or colour), m; None: only a calibration file tells
+    # place of its first camera (left or colour), m; None: only a calibration file has it
     position_m: Vector3 | None = None
     tilt_deg: Annotated[float, Range(-90.0, 90.0)] = 0.0  # nose down from looking ahead
     imu_rate_hz: Positive = 200.0  # of its own IMU's gyro, where that is read; the nearest that it has
@@ -184,7 +184,7 @@ class SensorsConfig:
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     gyroscope_noise_density: NonNegative = 5.2e-4  # rad/s/sqrt(Hz) without a noise file: the ITG3205's data sheet
     accelerometer_noise_density: NonNegative = 6.0e-3  # m/s^2/sqrt(Hz): the ADXL345's data sheet, its worst axis
-    gyroscope_random_walk: NonNegative = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet tells it
+    gyroscope_random_walk: NonNegative = 2e-5  # rad/s^2/sqrt(Hz), usual for such chips; no data sheet has it
     accelerometer_random_walk: NonNegative = 2e-4  # m/s^3/sqrt(Hz), as well
     # horizontal field of view without a camera file; webcams have 60 to 80
     hfov_deg: Annotated[float, Range(0.0, 180.0, without_low=True, without_high=True)] = 70.0
