@@ -99,9 +99,9 @@ class GraphConfig:
     pending_max: Whole = 200  # pending loops kept; the oldest leave first
     # nats of information that a keyframe's loops must add to the graph to get factors, where loops are many
     loop_gain_min: NonNegative = 0.5
-    # loops in the graph, from which on they are many: those of a keyframe are then tied to one anchor, and ...
+    # loops in the graph, from which on they are many: those of a keyframe are then tied to one anchor
     anchor_after: Whole = 20
-    freeze_keyframes: Count = 40  # ... leave the solver together, once they are ...
+    freeze_keyframes: Count = 40  # where loops are many, this number leave the solver together, once they are ...
     freeze_after: Whole = 200  # ... this number of keyframes old; they are then held relative to one that it keeps
 
     # the link to a keyframe with which a new submap begins: nothing is known, but equations stay solvable.

@@ -124,7 +124,7 @@ def _normalise(pixels: Array, lens: Lens) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class CameraSigmas:
-    """How far a camera may be from its calibration, 1 sigma; by default that of a board, or of a maker who says none.
+    """How far a camera may be from its calibration, 1 sigma; by default as for a board, or a maker who states none.
 
     EuRoC's own calibration leaves three systems 0.5 to 0.7 % too short, and turns of 0.3 mrad between its cameras.
     """

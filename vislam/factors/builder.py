@@ -126,7 +126,7 @@ class Builder:
     def _on_wheels(
         self, record: KeyframeRecord, before: Guess, has_imu: bool, floor_m: float
     ) -> list[gtsam.NonlinearFactor]:
-        """Return what is known of a cart on its floor, where the configuration says that this is one."""
+        """Return the factors of a cart on its floor, where it is configured as one."""
         machine, out = self._machine, list[gtsam.NonlinearFactor]()
         if machine.floor_sigma_m is not None:
             out.append(motion.on_floor(record.id, floor_m, machine.floor_sigma_m))
@@ -215,7 +215,7 @@ def read_guess(values: gtsam.Values, k: int, has_imu: bool) -> Guess:
 def of_vision(record: KeyframeRecord, config: GraphConfig, vo_scale: float = 1.0) -> Array:
     """Return the covariance [6, 6] of a keyframe's motion by vision.
 
-    How sure metric motions are, front ends measure; `vo_inflation` is for one camera, which goes by residuals alone.
+    Front ends measure the covariance of metric motions; `vo_inflation` is for one camera, which uses residuals alone.
     """
     assert record.covariance is not None
     of_residuals = 1.0 if record.has_scale else config.vo_inflation

@@ -125,7 +125,7 @@ def _as_said(packet: KeyframePacket, previous: KeyframeRecord | None) -> Keyfram
     starts = checked_starts(packet.own_starts, what)
     if previous is None:
         return KeyframeRecord(0, keyframe.t_ns, None, None, True, False, None, None, own_starts=starts)
-    if packet.begins_submap:  # of another recording perhaps, whose clock began anew
+    if packet.begins_submap:  # of another recording perhaps, with a clock of its own
         is_tied = packet.is_tied and vo.keyframe_id == previous.id
         return KeyframeRecord(
             keyframe.id, keyframe.t_ns, vo.T_keyframe_body if is_tied else None, vo.covariance if is_tied else None,
@@ -161,7 +161,7 @@ def loop_record(edge: LoopEdge, newest_id: int) -> LoopRecord:
 
 
 def _are_useful(T: Array, covariances: Array, has_scale: NDArray[np.bool_], durations_s: Array) -> NDArray[np.bool_]:
-    """Return whether odometry [N] says what can be believed; Gauss-Newton diverges on motions without."""
+    """Return whether motions of odometry [N] are certain enough to be used; on others Gauss-Newton diverges."""
     sigma_rad = np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1])
     sigma_m = np.sqrt(np.linalg.eigvalsh(covariances[:, 3:, 3:])[:, -1])
     speed = np.linalg.norm(T[:, :3, 3], axis=1) / durations_s

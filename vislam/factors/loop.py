@@ -56,7 +56,7 @@ class LoopModel:
         """Let another keyframe stand for the older one: T_anchor_from [4, 4] is where that is, known to `covariance`.
 
         T_from_to [4, 4] is how the graph has the loop now: without scale, the loop takes the length of the way from it,
-        and keeps a variance along the way that says that it did not measure it. Returns False, and changes nothing,
+        and keeps the variance along the way of a length that was not measured. Returns False, and changes nothing,
         where that would add more than `most` times the loop's own variance in rotation or translation.
         """
         T, own = self._as_pose(T_from_to)

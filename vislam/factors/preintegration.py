@@ -24,7 +24,7 @@ _BRIDGE_STEP_S = 0.005  # outages are integrated in steps of this length
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Preintegrated:
-    """A preintegrated span; `outage_s` is how much of it nobody measured."""
+    """A preintegrated span; `outage_s` is how much of it has no samples."""
 
     pim: gtsam.PreintegratedCombinedMeasurementsG
     duration_s: float
@@ -35,7 +35,7 @@ class Preintegrator:
     """Turns IMU spans into combined factors."""
 
     def __init__(self, config: GraphConfig, noise: ImuNoise, machine: MachineConfig) -> None:
-        """Set up the noise of the IMU, its walks floored as `config` says; spans scale the white part."""
+        """Set up the noise of the IMU, its walks at least the floors above; spans scale the white part."""
         self._config = config
         self._machine = machine
         self._max_gap_s = noise.gap_s(machine.max_gap_s)
@@ -117,7 +117,7 @@ class Preintegrator:
         accel: Array,
         duration_s: float,
     ) -> None:
-        """Integrate across an outage between two samples [2, 3], with noise that says nobody measured.
+        """Integrate across an outage between two samples [2, 3], with the noise of an unmeasured motion.
 
         A density s * sqrt(duration) makes velocity uncertain by s * duration in the end, as an unknown constant would.
         """

@@ -106,8 +106,8 @@ class ReadingFactor:
     ) -> None:
         """Take readings with the noise that they have at two poses [4, 4] and own variables [V].
 
-        `units` [V] are those in which the solver has the variables. `failed` is told the number of each reading at
-        which the sensor's own code fails, here or later; it then says nothing.
+        `units` [V] are those in which the solver has the variables. `failed` is called with the number of each reading
+        at which the sensor's own code fails, here or later; that reading then adds no information.
         """
         self._sensor = sensor
         self._units = units
@@ -212,9 +212,9 @@ class ReadingFactor:
 
 
 def as_motion(sensor: Sensor, placed: Sequence[PlacedReading], own: OwnNow, failed: Callable[[int], None]) -> Motion:
-    """Return readings of a sensor as a function of both poses, at own variables that somebody else estimates.
+    """Return readings of a sensor as a function of both poses, at own variables that are estimated elsewhere.
 
-    `failed` is told as that of a factor is; noise is as at the poses of the first call.
+    `failed` is called as that of a factor is; noise is as at the poses of the first call.
     """
     made: list[ReadingFactor] = []
 

@@ -2,7 +2,7 @@
 
 Each own variable is a key of one number, in units of how well it was known when the sensor began: gtsam's thresholds of
 relinearisation hold for all keys of one letter. One that does not change has one key; one that walks has a key at each
-keyframe with readings, tied to the one before, and begins anew with each submap. One that forgets does likewise.
+keyframe with readings, tied to the one before, and begins again with each submap. One that forgets does likewise.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from vislam.factors.solvers import RELINEARIZE_OWN, RELINEARIZE_TRANSLATION_M
 from vislam.sensors import USER_ERRORS, Suite, Variable
 
 Covariance = Callable[[list[int]], Array | None]  # the joint one of keys
-_REFRESHED = 6  # readings that are linearised anew with a keyframe, or those of one entry where they are more
+_REFRESHED = 6  # readings that are linearised again with a keyframe, or those of one entry where they are more
 _NEWEST, _BLOCK = 20, 40  # entries that are looked at with each keyframe: the newest, and older ones in turn
 _SIGMA_MIN = 1e-9  # of a prior: one that is known exactly must not be divided by
 
 
 class Admission:
-    """Says which readings are used, and counts those that are not."""
+    """Decides which readings are used, and counts those that are not."""
 
     def __init__(self, suite: Suite, counts: ReadingCounts) -> None:
-        """Set up for the sensors of a machine; `counts` is told."""
+        """Set up for the sensors of a machine; unusable readings are counted in `counts`."""
         self._suite = suite
         self._counts = counts
 
@@ -118,7 +118,7 @@ class Readings:
     """Owns the readings of a run as records; factors are built from them at any estimate, as often as asked.
 
     Factors are linear: gtsam copies all its values into each call of a function in Python, and would call it for all
-    readings whenever a variable that they share moves. Those whose estimate has moved since are linearised anew, a few
+    readings whenever a variable that they share moves. Those whose estimate has moved since are linearised again, a few
     with each keyframe, and all of them with each new start of the solver.
     """
 
@@ -284,7 +284,7 @@ class Readings:
         self._begun[start.sensor] = _Begun(guess, values, np.maximum(units, _SIGMA_MIN))
 
     def _entry(self, name: str, placed: list[PlacedReading], record: KeyframeRecord) -> _Entry:
-        """Return what a sensor says with a keyframe; the keys do not hang on whether its code works."""
+        """Return a sensor's readings with a keyframe; the keys do not depend on whether the sensor's code works."""
         self._counts.add(name, "used", len(placed))
         entry = _Entry(len(self._entries), name, record.id, placed)
         if not self._suite[name].variables:
@@ -365,7 +365,7 @@ def _ties(entry: _Entry, begun: _Begun | None, variables: Sequence[Variable]) ->
             else:
                 out.append(_forgetting(earlier, entry.keys[n], decay, variable.start / unit, model))
         elif entry.new[n]:
-            # what walks and begins anew with a submap has walked nobody knows how far since it was told
+            # what walks and begins again with a submap has walked an unknown way since its value was given
             sigma = 1.0 if entry.number == begun.first else max(variable.sigma / unit, 1.0)
             model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
             out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], model))

@@ -12,7 +12,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 
 _FACING_MIN = 0.1  # bounds the residual near the opposite direction
-_NO_DIRECTION = 0.5  # a translation column shorter than this says: no parallax
+_NO_DIRECTION = 0.5  # a translation column shorter than this means no parallax
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ def direction_as_pose(
     """Return an unscaled relative pose as a metric one [4, 4] with covariance [6, 6], long along the unknown scale.
 
     All poses whose camera moved along the measured direction lie on a line, t = s d - (R - 1) lever, so a covariance
-    that is long along d says exactly what was measured. `step_m` is the expected length of the step: it places the
+    that is long along d states exactly what was measured. `step_m` is the expected length of the step: it places the
     mean, with `scale_sigma` relative uncertainty, and turns the direction's angle into metres.
 
     A graph full of these needs no Python callback: gtsam copies all its values into each call of a CustomFactor, which
@@ -152,7 +152,7 @@ def pose_factor(key_a: int, key_b: int, T_a_b: Array, model: gtsam.noiseModel.Ba
 
 
 def measurement_of(factor: gtsam.BetweenFactorPose3) -> tuple[Array, Array]:
-    """Return the motion [4, 4] that a relative pose factor without a kernel says, and its information [6, 6]."""
+    """Return the motion [4, 4] of a relative pose factor without a kernel, and its information [6, 6]."""
     model = factor.noiseModel()
     assert isinstance(model, gtsam.noiseModel.Gaussian)
     return factor.measured().matrix(), model.information()

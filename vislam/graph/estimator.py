@@ -233,7 +233,7 @@ class Estimator:
     def converge(self) -> str:
         """Iterate to convergence, then keep the better of that and a batch solution; return which, with the costs.
 
-        The batch integrates the IMU anew at the final biases and has all loops as measured, so both are judged on that
+        The batch integrates the IMU again at the final biases and has all loops as measured, so both are judged on that
         graph.
         """
         note = ""

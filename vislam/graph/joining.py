@@ -156,7 +156,7 @@ class Waiting:
         return None if best is None or len({e.record.to_id for e in best[1]}) < JOIN_FRAMES else best
 
     def _agree(self, one: LoopModel, other: LoopModel, T: Array, ends: _Ends, known: RelativeCovariance) -> bool:
-        """Return whether a loop fits where another one, which asks for the motion `T`, says that it should."""
+        """Return whether a loop agrees with the motion `T` that follows from another one, to their uncertainty."""
         a, b = one.record, other.record
         T_from, T_to = ends.of(other, T)
         if self._are_far(other, T_from, T_to):

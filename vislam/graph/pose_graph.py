@@ -75,8 +75,8 @@ class PoseGraph:
 
     Coupling `loose`: motions of visual odometry and preintegrated IMU are its factors. Coupling `tight`: a sliding
     window optimises tracks and IMU of the newest keyframes, and its edges and tilts are the factors of poses alone.
-    Bad input raises DataError before anything is touched. Whatever gtsam does, `add` returns an update; its note says
-    what happened where not a plain one. Lost vision, IMU outages and refused loops are values.
+    Bad input raises DataError before anything is touched. Whatever gtsam does, `add` returns an update; its note
+    reports what was unusual. Lost vision, IMU outages and refused loops are values.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class PoseGraph:
     ) -> None:  # fmt: skip
         """Set up for a rig; without `noise` there is no IMU and only poses are estimated.
 
-        `suite` has the sensors whose readings become factors; `readings.counts` tells what became of them.
+        `suite` has the sensors whose readings become factors; `readings.counts` counts what became of them.
         """
         self._config = config
         self._noise = noise
@@ -118,7 +118,7 @@ class PoseGraph:
     def initialise(self, state: NavState | None, T_map_body: Array | None = None) -> None:
         """Set the state of keyframe 0 in map: gravity-aligned pose, velocity, biases; None without an IMU.
 
-        Then `T_map_body` [4, 4] says where keyframe 0 is put, by default at the identity.
+        Without, keyframe 0 is put at `T_map_body` [4, 4], by default the identity.
         Raises DataError on numbers that cannot be used and UsageError when it does not fit the graph.
         """
         if self._keyframes:
@@ -179,7 +179,7 @@ class PoseGraph:
         return update
 
     def go_on(self, packet: KeyframePacket, T_odom_body: Array | None = None) -> None:
-        """Begin anew at the newest keyframe of `restore`, seen again: its packet, without inertial data."""
+        """Begin again at the newest keyframe of `restore`, seen again: its packet, without inertial data."""
         if not self._keyframes or packet.keyframe.id != self._keyframes[-1].id:
             raise UsageError(f"keyframe {packet.keyframe.id} is not the newest of the graph")
         self._source.go_on(packet, self._estimator.poses[-1], T_odom_body)
@@ -236,7 +236,7 @@ class PoseGraph:
         return self._publish(accepted, refused, "; ".join(n for n in notes if n))
 
     def finish(self, undo: Sequence[int] = ()) -> GraphUpdate:
-        """Iterate to convergence and return all poses; the note tells cost and way. `undo` as for `add`."""
+        """Iterate to convergence and return all poses; the note has costs and method. `undo` as for `add`."""
         if not self._keyframes:
             return GraphUpdate(self._published.revision, np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.eye(4), None)
         before, notes = self._estimator.poses[-1].copy(), list[str]()

@@ -13,7 +13,7 @@ from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS, Solver, optimize
 from vislam.graph.records import Whole, graph_of
 
 BATCH_ITERATIONS = 50
-_ROUNDS, _GAIN = 3, 1e-4  # in which readings are linearised anew, at most; a smaller relative gain ends them
+_ROUNDS, _GAIN = 3, 1e-4  # in which readings are linearised again, at most; a smaller relative gain ends them
 
 
 class Settled(NamedTuple):

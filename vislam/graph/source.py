@@ -74,7 +74,7 @@ class Source(Protocol):
         """Take all keyframes of an earlier run, after `begin`; return the last estimate of each."""
 
     def go_on(self, packet: KeyframePacket, T_map_body: Array, T_odom_body: Array | None) -> None:
-        """Begin anew at the newest keyframe that `restore` brought: as it is in map, and as it is seen now."""
+        """Begin again at the newest keyframe that `restore` brought: as it is in map, and as it is seen now."""
 
     def take_states(self, newest: NavState | None) -> tuple[tuple[int, NavState], ...]:
         """Return the states of keyframes that are to be remembered since the last call; `newest` is that in map."""
@@ -83,10 +83,10 @@ class Source(Protocol):
         """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
 
     def relink(self, k: int, T_previous_body: Array) -> None:
-        """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
+        """Give the link with which keyframe k begins a submap that motion [4, 4], with its covariance as before."""
 
     def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
-        """Return the state of keyframe k in map with its covariance, NaN where nobody can tell."""
+        """Return the state of keyframe k in map with its covariance, NaN where that is unknown."""
 
 
 class MotionSource:
@@ -171,9 +171,9 @@ class MotionSource:
 class WindowSource:
     """Tight coupling: a sliding window estimates states and landmarks, and the graph takes its edges and tilts.
 
-    Of depth images as surfaces the window knows nothing. Where it has no inertial data either, the edge of a keyframe
-    whose motion surfaces had a say in is odometry's. Where it has, what depth alone says of a motion that no track
-    tells goes into the edge as well.
+    The window does not use depth images as surfaces. Where it has no inertial data either, the edge of a keyframe whose
+    motion was found with surfaces is odometry's. Where it has, a motion that depth alone measured, without any track,
+    is fused into the edge as well.
     """
 
     def __init__(self, config: GraphConfig, machine: MachineConfig, window: Window) -> None:
@@ -307,7 +307,7 @@ class WindowSource:
         return WindowRecord(record.id, record.t_ns, tuple(kept), tilts, note, record.rest_from)
 
     def _note_depth(self, packet: KeyframePacket, record: KeyframeRecord) -> None:
-        """Remember the motion to a keyframe of which depth images said what windows do not hear of."""
+        """Remember the motion to a keyframe that was found with surfaces, which a window does not use."""
         T, covariance = record.T_previous_body, record.covariance
         if not packet.vo.by_surfaces or record.begins_submap or T is None or covariance is None:
             return
@@ -317,10 +317,10 @@ class WindowSource:
             self._by_depth[record.id] = T, covariance
 
     def _with_depth(self, edge: EdgeRecord) -> EdgeRecord:
-        """Return an edge of the window with what depth says of the same motion, if it does.
+        """Return an edge of the window with the same motion as measured by depth, where there is such a measurement.
 
-        What depth alone says errs apart from it. With what tracks and depth say together it has the tracks in common,
-        so that stands in its place.
+        The error by depth alone is independent of the edge's: they are fused. A motion by tracks and depth together has
+        the tracks in common with the edge, so it takes its place.
         """
         together, apart = self._by_surfaces.get(edge.to_id), self._by_depth.get(edge.to_id)
         if edge.settled:
@@ -357,7 +357,7 @@ class WindowSource:
 def in_map(local: NavState, T_map_body: Array, pose_covariance: Array | None) -> NavState:
     """Return a state of a window at its pose in map [4, 4].
 
-    The window says how velocity and biases depend on the pose, the graph how well the pose is known: `pose_covariance`
+    The window gives how velocity and biases depend on the pose, the graph how well the pose is known: `pose_covariance`
     [6, 6] in NavState's axes takes the place of the window's own, and what depends on it follows.
     """
     state = at_pose(local, T_map_body)
@@ -395,7 +395,7 @@ def _is_direction(v: Array) -> bool:
 
 
 def _better_state(packet: KeyframePacket, newest: NavState | None) -> tuple[NavState | None, str]:
-    """Return the filter's state and why, where the window has to begin anew at it; None: the window may go on.
+    """Return the filter's state and why, where the window has to begin again at it; None: the window may go on.
 
     After a blind stretch by inertial data alone its speed is metres per second off, too far to be linearised there.
     And from steady motion into a turn a window of one camera may take a tilt for an acceleration, and be sure of it.
@@ -411,10 +411,10 @@ def _better_state(packet: KeyframePacket, newest: NavState | None) -> tuple[NavS
         (ours, P), (theirs, Q) = _body_velocity(newest), _body_velocity(known)
         apart = ours - theirs
         if float(apart @ np.linalg.solve(P + Q, apart)) > _CONTRADICTION:
-            told = f"off by {float(np.linalg.norm(apart)):.2f} m/s"
+            off = f"off by {float(np.linalg.norm(apart)):.2f} m/s"
             return (
                 known,
-                f"the window begins anew: its speed is {told} from the filter's, which a sensor of motion tells",
+                f"the window begins anew: its speed is {off} from the filter's, which a sensor of motion tells",
             )
     return None, ""
 

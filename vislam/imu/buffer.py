@@ -33,7 +33,7 @@ class ImuBuffer:
         self._max_gap_ns = round(machine.max_gap_s * _NS)
         self._samples = 0
         self._forget_at_ns = 0
-        self._disbelieved: list[tuple[int, StreamEvent]] = []  # after which time, and what says so
+        self._disbelieved: list[tuple[int, StreamEvent]] = []  # after which time, and the event that shows it
         self._believes = True  # now
 
     @property

@@ -1,10 +1,10 @@
 """Which loops of a run to believe together: the most certain ones first, each tested against those believed before.
 
-Where odometry is uncertain, a false loop passes any test against it, and whichever comes first wins. Taken in the
-order of the evidence that odometry alone gives them, loops over short stretches, which it can tell, tie the run
-together before those over long ones are asked, and few false ones pass. What is kept is scored by its evidence: the
-likelihood of what each witness said over that of a false loop, which may say anything. Hypotheses that start otherwise
-are compared by it: a group of refused loops that confirm one another taken first, or odometry worse than it says.
+Where odometry is uncertain, a false loop passes any test against it, and whichever comes first wins. Loops are
+therefore taken in the order of the evidence that odometry alone gives them: those over short stretches, which it can
+test, tie the run together before those over long ones are tested, and few false ones pass. What is kept is scored by
+its evidence: the likelihood of each witness's measurement over that of a false loop, which is uniform. Other hypotheses
+are compared by it: refused loops that confirm one another taken first, or odometry with larger sigmas than stated.
 
 Work comes in small steps (generators), so that a live run can spread it over keyframes.
 """
@@ -30,12 +30,12 @@ from vislam.factors.visual import pose_factor
 from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
 from vislam.graph.travel import Chain, Travel
 
-_REVIEW_LOOPS = 20  # loops after which all are weighed anew, if any was kept out; ...
-_REVIEW_DOUBTS = 3  # ... or so many that were kept out
+_REVIEW_LOOPS = 20  # loops after which all are weighed again, if any was kept out; ...
+_REVIEW_DOUBTS = 3  # ... or loops kept out, after which they are
 _REVIEW_STEPS = 4  # of a review's work per keyframe: joint marginals of a small graph, 1 to 3 ms each
 _LADDER = (11.0, 7.0, 3.0)  # evidence that a witness could give, in nats: those of the first rung are asked first
 _EXPECTED = 3.0  # half the chi-square of six degrees of freedom, what a true loop loses of it
-_SCALES = (2.0, 4.0, 8.0)  # on the sigmas of odometry, tried where it seems to be worse than it says
+_SCALES = (2.0, 4.0, 8.0)  # on the sigmas of odometry, tried where it seems to be worse than these
 _MARGIN = 10.0  # nats by which another hypothesis must be better
 _NODES = 16  # keyframes of the small graph that count as one step of work
 _RATIO_MAX = 1e9  # eigenvalues of a covariance summed along the run
@@ -112,7 +112,7 @@ class Consensus:
     def step(self, travel: Travel, scale_left: float, held: Callable[[int], bool]) -> Verdict | None:
         """Do some work; return a verdict when a review has come to its end.
 
-        `scale_left` is by how much the sigmas of odometry may still be inflated, `held` tells of the id of a loop
+        `scale_left` is by how much the sigmas of odometry may still be inflated; `held` returns for the id of a loop
         whether the graph holds it. Without a loop in doubt there is nothing to review.
         """
         if self._steps is None:

@@ -150,8 +150,8 @@ class Gate:
         chi2 = loop.chi2(*self._held.ends(loop), relative(record.from_id, record.to_id))
         inside = bool(chi2 <= loop.threshold)
         decision = LoopDecision.ACCEPTED if inside else LoopDecision.PENDING
-        says, side = ("odometry allows it", "within") if inside else ("odometry speaks against it", "beyond")
-        reason = f"{says}: chi2 {chi2:.1f} {side} {loop.threshold:.1f}"
+        finding, side = ("odometry allows it", "within") if inside else ("odometry speaks against it", "beyond")
+        reason = f"{finding}: chi2 {chi2:.1f} {side} {loop.threshold:.1f}"
         self._reports.begin(EdgeReport(record.id, record.from_id, record.to_id, chi2, 0.0, decision, reason))
         return inside
 

@@ -37,7 +37,7 @@ class HeldLoops:
 
     @property
     def are_many(self) -> bool:
-        """Return whether there are so many loops that the work of an update has to be kept from growing with them."""
+        """Return whether loops are too many for the work of an update to grow with their number."""
         estimator = self._estimator
         are_summed_up = bool(estimator.summed_up.firsts)
         return estimator.is_long or are_summed_up or len(estimator.loops) >= self._config.anchor_after

@@ -70,10 +70,10 @@ class Known:
 
 
 def worth_a_factor(groups: Sequence[Sequence[LoopModel]], known: Known, gain_min: float) -> list[list[LoopModel]]:
-    """Return those groups of loops that are worth their factors, the one with most to tell first.
+    """Return those groups of loops that are worth their factors, the one with most information first.
 
-    Each is judged by the information in nats that it adds to what the graph knows and the ones before it told; less
-    than `gain_min` is not worth it. The measure is that by which Kretzschmar and Stachniss choose scans
+    Each is judged by the information in nats that it adds to the graph's and to that of the ones before it; less than
+    `gain_min` is not worth it. The measure is that by which Kretzschmar and Stachniss choose scans
     ("Information-theoretic compression of pose graphs for laser-based SLAM", IJRR 2012). `known` has learnt those
     that are returned.
     """

@@ -1,4 +1,4 @@
-"""The loops of a graph: tested, kept pending, let in, reviewed and taken out, each with a report that says why."""
+"""The loops of a graph: tested, kept pending, let in, reviewed and taken out, each reported with the reason."""
 
 from __future__ import annotations
 
@@ -237,8 +237,8 @@ class LoopSet:
     def test(self, models: Sequence[LoopModel]) -> tuple[list[LoopModel], list[LoopModel]]:
         """Test loops against the current estimate, and give them to the next review.
 
-        Returns those that are to enter the graph and those to be pending. Where loops are many, one that fits and tells
-        the graph next to nothing is kept in spare.
+        Returns those that are to enter the graph and those to be pending. Where loops are many, one that fits and adds
+        little information is kept in spare.
         """
         if not models:
             return [], []
@@ -312,16 +312,16 @@ class LoopSet:
         return contradicted
 
     def _apply(self, verdict: Verdict, notes: list[str]) -> list[int]:
-        """Do as a review of all loops says; return the ids about which it decided something else than before."""
+        """Apply a review of all loops; return the ids about which it decided something else than before."""
         estimator, newest = self._estimator, len(self._estimator.poses) - 1
         contradicted = [(m, chi2) for m, chi2 in verdict.put_out if m.id in self._held]
         out = [m for m, _ in contradicted]
         back = [m for m in verdict.let_in if m.id not in self._held and m.id not in self._beyond_help]
         for model, chi2 in contradicted:
             estimator.spare.pop(model.id, None)
-            says = f"{verdict.places} place{'s say' if verdict.places > 1 else ' says'} otherwise, chi2 {chi2:.1f}"
-            self.ledger.add(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {says}")
-        if verdict.scale > 1.0 and back:  # several witnesses against the odometry say that it knows less than it says
+            against = f"{verdict.places} place{'s say' if verdict.places > 1 else ' says'} otherwise, chi2 {chi2:.1f}"
+            self.ledger.add(model, LoopDecision.REJECTED, f"taken out again at keyframe {newest}: {against}")
+        if verdict.scale > 1.0 and back:  # several witnesses show that odometry's sigmas are too small
             estimator.distrust_odometry(verdict.scale)
             self._travel.scale(verdict.scale)
         self._pending.remove(back)
