@@ -118,7 +118,7 @@ class PoseGraph:
     def initialise(self, state: NavState | None, T_map_body: Array | None = None) -> None:
         """Set the state of keyframe 0 in map: gravity-aligned pose, velocity, biases; None without an IMU.
 
-        Without, keyframe 0 is put at `T_map_body` [4, 4], by default the identity.
+        Without an IMU keyframe 0 is put at `T_map_body` [4, 4], by default the identity.
         Raises DataError on numbers that cannot be used and UsageError when it does not fit the graph.
         """
         if self._keyframes:

@@ -51,10 +51,10 @@ class Back:
         suite: Suite | None = None,
         labeller: Labeller | None = None,
     ) -> None:
-        """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where no IMU tells gravity.
+        """Build the stages for a first keyframe at `T_map_body`; `first_state` is None where gravity is unknown.
 
         `config` is as `settings.derived` gives it; `suite` has the sensors whose readings the graph takes; `labeller`
-        tells the labels of keyframes, None: the folder in the settings does, if there is one.
+        gives the labels of keyframes; None: they are read from the folder in the settings, if there is one.
         """
         self._has_gravity = has_gravity = first_state is not None
         graph = config.graph if has_gravity else without_gravity(config.graph, rig)

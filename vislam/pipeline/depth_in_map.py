@@ -1,8 +1,8 @@
-"""Where a keyframe is in the map of an earlier run by its depth, where images do not tell: in the dark, in other light.
+"""Where a keyframe is in the map of an earlier run by its depth, where images find none: in the dark, in other light.
 
-It needs to be known about where that is: the pose carried on from the last loop through odometry, whose covariance the
-graph tells, or one that somebody gave. What depth answers (`DepthLocaliser`) is offered as a loop like any other once
-several keyframes in a row agree through odometry; the graph tests it then as it tests all.
+A rough pose must be known: carried on from the last loop through odometry, with its covariance from the graph, or given
+by the user. The pose by depth (`DepthLocaliser`) is offered as a loop like any other once several keyframes in a row
+agree through odometry; the graph tests it then as it tests all.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed at j
 
 _LEAST_M, _LEAST_DEG = 0.05, 3.0  # of a guess's standard deviations: where several starts are to end in one place
-_TOLD_M, _TOLD_DEG = 0.3, 15.0  # of a pose that somebody gave: "near the charging station"
+_TOLD_M, _TOLD_DEG = 0.3, 15.0  # of a pose given by the user: "near the charging station"
 _DRIFT = 0.05  # of the way since then: odometry that nothing holds
 _MOST_M, _MOST_DEG = 0.5, 20.0  # farther off, depth was measured to find false places
 
@@ -76,7 +76,7 @@ class DepthInMap:
     def look(
         self, odometry: OdometryKeyframe, T_map_odom: Array, known: RelativeCovariance, edges: Sequence[LoopEdge]
     ) -> tuple[Candidate, Verification] | None:
-        """Return what depth says of a new keyframe; None where it has nothing to say, or need not be asked.
+        """Return the loop proposed by a new keyframe's depth; None without a guess, or with a loop into the map.
 
         Args:
             odometry: the keyframe, which the graph does not have yet.
@@ -129,7 +129,7 @@ class DepthInMap:
         )  # fmt: skip
 
     def _agree(self, before: DepthAnswer, now: DepthAnswer, packet: KeyframePacket) -> bool:
-        """Return whether two answers are as far from one another as odometry says that their keyframes are."""
+        """Return whether two answers are as far from one another as their keyframes are by odometry."""
         moved = packet.vo.T_keyframe_body
         if moved is None or packet.begins_submap:
             return False
@@ -138,7 +138,7 @@ class DepthInMap:
         return float(change @ np.linalg.solve(covariance, change)) < self._limit
 
     def _guess(self, odometry: OdometryKeyframe, T_map_odom: Array, known: RelativeCovariance) -> Guess | None:
-        """Return where the body is thought to be; None where nobody knows, or it is known well enough already."""
+        """Return where the body is thought to be; None where that is unknown, or known well enough already."""
         config, packet, T_odom_body = self._config, odometry.packet, odometry.T_odom_body
         k = packet.keyframe.id
         is_joined = not packet.begins_submap and self._submaps.group(k) == 0
@@ -176,7 +176,7 @@ class DepthInMap:
         return 2.0 * DEPTH_APART_S**2 * np.outer(twist_per_s, twist_per_s)
 
     def _follow(self, odometry: OdometryKeyframe) -> None:
-        """Carry on the pose that somebody gave of the first keyframe, and the time; a loss of track ends the former."""
+        """Carry on the pose given for the first keyframe, and the time; a loss of track ends the former."""
         T_odom_body, t_ns = odometry.T_odom_body, odometry.packet.keyframe.t_ns
         self._since_s, self._t_ns_before = (t_ns - self._t_ns_before) * 1e-9, t_ns
         if self._told is not None:

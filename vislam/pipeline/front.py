@@ -209,7 +209,7 @@ class Front:
 
     @property
     def _imu(self) -> Inertial | None:
-        """The inertial stages, as long as the run goes by them."""
+        """The inertial stages, as long as the run uses them."""
         return None if self.begun.phase is Phase.VISION_ALONE else self.inertial
 
     def _track(self, frame: Frame, since: Since) -> TrackResult:
@@ -220,7 +220,7 @@ class Front:
         return replace(track, vo=self.camera_clock.loosened(track.vo, since.span, since.state))
 
     def _linked(self, frame: Frame, track: TrackResult) -> TrackResult:
-        """Return the track, tied to the keyframes of an earlier run where it begins anew."""
+        """Return the track, tied to the keyframes of an earlier run where it begins again."""
         memory = self.begun.see_again(self.inertial is not None)
         if memory is not None and track.keyframe is None:  # too little to see there for a start: a lost keyframe
             self.frontend.begin_at(memory.keyframe_id + 1, memory.learned)

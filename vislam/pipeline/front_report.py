@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _PIECE_S = 0.2  # over which force is averaged: noise and vibration show no scale
 _PIECES = 20  # 4 s, the longest that the search for a first scale looks at, too
 _NUMBER = re.compile(r"\d+(\.\d+)?")
-_MOST_REASONS = 50  # that are told apart
+_MOST_REASONS = 50  # that are counted separately
 # a run whose quietest second has less than a third of the white noise given is warned
 _NOISE_TOLERANCE = 3.0
 
@@ -52,7 +52,7 @@ class FrontReport:
     counters: dict[str, dict[str, int]]
     nis: dict[str, tuple[int, float, int]]  # innovations that the filter accepted, see `Ekf.nis_statistics`
     noise_warnings: list[str]
-    imu_noise: dict[str, dict[str, float]]  # white noise of the IMU: told, and what the samples showed
+    imu_noise: dict[str, dict[str, float]]  # white noise of the IMU: stated, and as the samples showed it
     uniform_s: float  # longest stretch without motion that shows scale
     calibration: dict[str, float]  # what was learned of the camera
     scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
@@ -98,7 +98,7 @@ class UniformMotion:
         return self._lasted_s == 0.0
 
     def add(self, span: ImuSpan | None, state: NavState | None, at_rest: bool) -> None:
-        """Take a frame's inertial span and the filter's state at its end; rest holds scale, and outages start anew."""
+        """Take a frame's inertial span and the filter's state at its end; rest and outages start the 4 s again."""
         if span is None or state is None or at_rest:
             self._forces.clear()
             self._sum_m_s, self._piece_s, self._lasted_s = np.zeros(3), 0.0, 0.0
@@ -123,7 +123,7 @@ class UniformMotion:
 
 
 class RunWatch:
-    """Watches the frames of a run go by, for its report.
+    """Collects what becomes of a run's frames, for its report.
 
     Attributes:
         counters: what became of frames.

@@ -121,7 +121,7 @@ class Start:
 class GravityWait:
     """Finds the first state and starts the filter from it; keyframes wait in the frame `vo` till the start is settled.
 
-    Until then the filter goes by the newest provisional start, if there is one.
+    Until then the filter uses the newest provisional start, if there is one.
     """
 
     def __init__(

@@ -46,7 +46,7 @@ class InMap:
     def take(
         self, front: FrontStep, keyframes: list[KeyframeStep], T_map_odom: Array | None
     ) -> tuple[Array | None, Localisation]:
-        """Return the pose in map [4, 4] after a frame, and whether the place is known; no pose while no loop tells it.
+        """Return the pose in map [4, 4] after a frame, and whether the place is known; None before a loop into it.
 
         What the graph corrected since the last frame is taken in as the body moves, but for where the place was found:
         what odometry made of `map` until then was a guess, and nothing in `map` could go on from it.

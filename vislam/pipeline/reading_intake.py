@@ -23,8 +23,8 @@ from vislam.sensors.body import between_keyframes
 _MAX_WAITING = 4096  # readings that wait for the filter to begin; older ones go
 _MAX_SINCE = 16384  # readings that wait for a keyframe; older ones go
 _MAX_TRIED = 1024  # readings that a sensor begins with; of more every other one is kept
-_MORE = 1.2  # so many times the readings of the last attempt before the next
-_FREE_FORCE_M_S2 = 1.0  # what a body does between keyframes of which no IMU tells
+_MORE = 1.2  # times the readings of the last attempt, before the next one
+_FREE_FORCE_M_S2 = 1.0  # noise assumed of a body's acceleration between keyframes, without an IMU
 _PROOFS = 5  # readings of each sensor by which its own Jacobians are compared with its residual
 _MIN_PATH_NS = 1_000  # a span of less is no span, and gains no speed that shows
 
@@ -40,9 +40,9 @@ class _Beginning:
 
 
 class ReadingIntake:
-    """Takes readings as they come, in any order; what nobody can use is counted and goes no further.
+    """Takes readings as they come, in any order; those that cannot be used are counted and dropped.
 
-    A sensor is somebody else's code: where its `check` raises the reading goes, where its `begin` raises the sensor.
+    A sensor is a user's code: an exception in its `check` drops the reading, one in its `begin` the sensor.
 
     Own variables, as the heading of a map of fixes, have to be known roughly before one linear step can be trusted: a
     sensor's first readings are compared with the path until `Sensor.begin` knows them.
@@ -52,8 +52,8 @@ class ReadingIntake:
             the filter; `dropped` had to wait for it for too long; with those of `beginning` a sensor looked for its own
             variables; `told` are those that the filter was given. And of these the graph never saw those that are
             `late`, as it had their keyframe already; `unplaced`, where it has no inertial data; `crowded` out, as too
-            many waited for a keyframe. Of wheels that slip neither was told those that `slipped`, and the graph not
-            those by which a `slip_began`.
+            many waited for a keyframe. Of wheels that slip neither got those that `slipped`, and the graph not those by
+            which a `slip_began`.
         notes: by sensor, why its first unusable reading was that, or why the sensor is left out.
     """
 
@@ -63,8 +63,8 @@ class ReadingIntake:
     ) -> None:  # fmt: skip
         """Set up for the sensors of a machine; without an IMU there is neither a filter nor inertial data.
 
-        `accelerometer_noise_density` (m/s^2/sqrt(Hz)) says how well inertial data know the path between two keyframes.
-        `has_window` says that behind keyframes comes a sliding window.
+        `accelerometer_noise_density` (m/s^2/sqrt(Hz)) sets the covariance of the inertial path between two keyframes.
+        `has_window`: keyframes go to a sliding window.
         """
         became = ("readings", "unusable", "too_early", "dropped", "beginning", "told", "late", "unplaced", "crowded")
         self.counters = {name: dict.fromkeys(became, 0) for name in suite.names}
@@ -244,7 +244,7 @@ class ReadingIntake:
         return bool(why)
 
     def _compare(self, reading: Reading) -> None:
-        """Compare a reading with the path, and begin the sensor once that tells its own variables."""
+        """Compare a reading with the path, and begin the sensor once that determines its own variables."""
         beginning = self._beginning[reading.sensor]
         body = self._body_at(reading.t_ns)
         if body is None:

@@ -44,13 +44,13 @@ def derived(config: Config, rig: Rig, noise: ImuNoise | None) -> Config:
 
 
 def refuse_up(noise: ImuNoise | None) -> None:
-    """Raise UsageError where up is told, and an IMU knows it."""
+    """Raise UsageError where up is given though an IMU measures it."""
     if noise is not None:
         raise UsageError("--up is for runs without an IMU, which knows it better; leave it away, or --imu.no-enabled")
 
 
 def refuse_without_scale(ekf: EkfConfig, has_scale: bool, has_imu: bool) -> None:
-    """Raise UsageError where one camera would have to tell metres."""
+    """Raise UsageError for settings that need scale by vision where one camera has none."""
     if has_scale:
         return
     if not has_imu:
@@ -66,7 +66,7 @@ def refuse_without_scale(ekf: EkfConfig, has_scale: bool, has_imu: bool) -> None
 
 
 def without_gravity(graph: GraphConfig, rig: Rig) -> GraphConfig:
-    """Return the graph's settings where no IMU tells gravity: nothing shares its scale.
+    """Return the graph's settings without an IMU for gravity: no edges share the IMU's scale.
 
     And a window sees no scale in one camera; over a floor, the motions of odometry have it.
     """

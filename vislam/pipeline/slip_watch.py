@@ -56,7 +56,7 @@ class SlipWatch:
             self.slips, self.times, self._begin_ns = True, self.times + 1, self._failing_ns
 
     def summary(self) -> dict[str, Any]:
-        """Return what a report says; empty where nothing slipped."""
+        """Return the entries of a report; empty where nothing slipped."""
         if not self.times:
             return {}
         return {"times": self.times, "seconds": self.seconds, "slips": self.slips, "contradicts": self.contradicts}

@@ -47,7 +47,7 @@ class FrontStep:
     keyframe_id: int  # the newest keyframe
     T_keyframe_body: Array | None  # relative to it; None: only known by interpolation between keyframes
     keyframes: list[OdometryKeyframe]  # usually none or one; those that waited for gravity come together
-    corrections: list[Correction]  # what the filter was told with it, usually one; none before it has a state
+    corrections: list[Correction]  # that the filter got with it, usually one; none before it has a state
 
     @property
     def moving(self) -> NavState | None:

@@ -26,7 +26,7 @@ def optics_of(rig: Rig) -> tuple[Array, Lenses, int]:
 class Calibration:
     """Owns the estimate [16], see `equations.layout`, of a window with an IMU, or with poses alone, which moves none.
 
-    Without inertial data nothing else knows metres or turns, and what vision alone says of its lens is too little.
+    Without inertial data scale and turns have no other source, and vision alone constrains its lens too weakly.
     """
 
     def __init__(self, config: WindowConfig, rig: Rig, noise: ImuNoise | None, time_offset_s: float) -> None:

@@ -19,7 +19,7 @@ _CONTRADICTED = 0.25  # of the tested views are as expected at most: a crowd of 
 _LEAST_SPREAD = 0.05  # no tracker is better, a fit to few views only looks so
 _LEAST_VIEWS, _LEAST_TESTED = 3, 30  # of a landmark, and of all, before their scatter means anything
 _MEDIAN_PX, _MEDIAN_DEPTH = 1.1774, 0.6745  # of the length of a normal error, in a plane and on a line
-_STUBBORN_KEYFRAMES = 4  # ... or after so many keyframes in a row, a wrong expectation
+_STUBBORN_KEYFRAMES = 4  # ... or, in this number of successive keyframes, a wrong prediction
 
 
 class Doubt:
@@ -35,7 +35,7 @@ class Doubt:
     def newest(
         self, tracks: TrackTable, keyframes: Keyframes, covariance: Array, calibration: Array, camera: Camera
     ) -> int:
-        """Take out what the newest keyframe saw and nobody expected; return of how many tracks.
+        """Take out observations of the newest keyframe that contradict the prediction; return the number of tracks.
 
         `covariance` [6 M + 16, 6 M + 16] is that of all poses, the newest a prediction, and of the calibration. If
         hardly anything is as expected, again and again, it is the expectation that is wrong, and all of it stays.

@@ -60,7 +60,7 @@ def predicted_covariance(known: Array, X: Array, calibration: Array, links: Link
         gravity_m_s2: of the link.
 
     Returns:
-        None where the link does not tell enough.
+        None where the link constrains the motion too weakly.
     """
     last = Links(*(a[-2:] if name == "rest_weight" else a[-1:] for name, a in links._asdict().items()))
     size = 30 + CALIBRATION

@@ -49,7 +49,7 @@ class Keyframes:
         return at_first_scale(self.X, self.X_first, self.held), np.ones(len(self), dtype=np.bool_)
 
     def push(self, packet: KeyframePacket, x: Array, T_odom_body: Array | None, turned_before: bool) -> None:
-        """Append a keyframe at state [21]; `turned_before` says that its span tells the rate of the first, too."""
+        """Append a keyframe at state [21]; `turned_before`: its span has the turn rate of the first, too."""
         gyro = np.zeros(3)
         if packet.imu is not None and len(packet.imu.t_ns) > 0 and not packet.at_rest:
             gyro = packet.imu.gyro_rad_s[-1]

@@ -1,4 +1,4 @@
-"""What the solved window says: relative poses, tilts, states and scale with their covariances."""
+"""The posterior of the solved window: relative poses, tilts, states and scale with their covariances."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ def check_observations(seen: Observations, where: str) -> None:
 def _rows_of(camera: Camera, pixels_px: Array, sigma_px: float, at_once: bool = False) -> Array:
     """Return rows [N, 8] of the table without depth; NaN where no ray gives the pixel.
 
-    `at_once` says that all rows of the image count as seen at the frame's own time.
+    `at_once`: all rows of the image count as seen at the frame's own time.
     """
     out = np.zeros((len(pixels_px), _VALUES))
     out[:, :2] = camera.normalise(pixels_px)

@@ -209,7 +209,7 @@ class SlidingWindow:
         x = self._first_state(packet) if len(keyframes) == 0 else self._predicted(packet, T_odom_body, motions)
         keyframes.push(packet, x, T_odom_body, self._links.usable(packet.imu))
         if packet.at_rest and self._at_rest:
-            # rest says that nothing moved; what else the pixels say is noise, and minutes of it would add up to drift
+            # at rest nothing moved: any motion of pixels is noise, and minutes of it would add up to drift
             self._tracks.remove(self._tracks.keyframe == keyframes.ids[-2])
         self._at_rest = packet.at_rest
         self._tracks.add(packet.keyframe.id, packet.observations)

@@ -3,8 +3,8 @@
 Where odometry is uncertain, a false loop passes any test against it, and whichever comes first wins. Loops are
 therefore taken in the order of the evidence that odometry alone gives them: those over short stretches, which it can
 test, tie the run together before those over long ones are tested, and few false ones pass. What is kept is scored by
-its evidence: the likelihood of each witness's measurement over that of a false loop, which is uniform. Other hypotheses
-are compared by it: refused loops that confirm one another taken first, or odometry with larger sigmas than stated.
+its evidence: the likelihood of each witness's measurement over the uniform one of a false loop. Other hypotheses are
+compared by it: refused loops that confirm one another taken first, or odometry with larger sigmas than stated.
 
 Work comes in small steps (generators), so that a live run can spread it over keyframes.
 """
@@ -35,7 +35,7 @@ _REVIEW_DOUBTS = 3  # ... or loops kept out, after which they are
 _REVIEW_STEPS = 4  # of a review's work per keyframe: joint marginals of a small graph, 1 to 3 ms each
 _LADDER = (11.0, 7.0, 3.0)  # evidence that a witness could give, in nats: those of the first rung are asked first
 _EXPECTED = 3.0  # half the chi-square of six degrees of freedom, what a true loop loses of it
-_SCALES = (2.0, 4.0, 8.0)  # on the sigmas of odometry, tried where it seems to be worse than these
+_SCALES = (2.0, 4.0, 8.0)  # on the sigmas of odometry, tried where these seem to be too small
 _MARGIN = 10.0  # nats by which another hypothesis must be better
 _NODES = 16  # keyframes of the small graph that count as one step of work
 _RATIO_MAX = 1e9  # eigenvalues of a covariance summed along the run

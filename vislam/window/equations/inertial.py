@@ -100,7 +100,7 @@ def _told_shift(a: Array, b: Array, at: Array) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _told_cost(X: Array, links: Links) -> float:
-    """Return what all that further sensors told costs, up to a constant."""
+    """Return the cost of all motions by further sensors, up to a constant."""
     total = 0.0
     for k in np.flatnonzero(links.told):
         d = _told_shift(X[k], X[k + 1], links.told_at[k])
@@ -113,7 +113,7 @@ def _told_cost(X: Array, links: Links) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_told(d: Array, links: Links, where: Ints, k: int, A: Array, g: Array) -> None:
-    """Add what further sensors told of link k, at a shift d [12], to the normal equations."""
+    """Add the motion of link k by further sensors, at a shift d [12], to the normal equations."""
     for i in range(12):
         at_i = where[k + i // 6, i % 6]
         total = links.told_b[k, i]
@@ -195,8 +195,8 @@ def linearise(
 ) -> None:
     """Add the first `count` links and rest of the first `rests` keyframes to the normal equations.
 
-    `where` [M, 15] (or [M, 6]) says at which unknown each keyframe's error lies; with six there are no velocities. The
-    calibration [16] comes after them.
+    `where` [M, 15] (or [M, 6]) are the indices of each keyframe's error among the unknowns; with six there are no
+    velocities. The calibration [16] comes after them.
     """
     X, X_first, held = states
     A, g = normal

@@ -83,7 +83,7 @@ def marginalise(
 
 
 def touched(prior: Prior, count: int, full: bool) -> NDArray[np.bool_]:
-    """Return which of `count` keyframes the prior says anything about."""
+    """Return which of `count` keyframes the prior constrains."""
     size = 15 if full else 6
     diagonal = np.diag(prior.H)[CALIBRATION:].reshape(-1, size)
     out = np.zeros(count, dtype=bool)

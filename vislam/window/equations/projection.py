@@ -223,7 +223,7 @@ def linearised(
 ) -> None:
     """Fill J [3, 26] with a view's whitened error and its derivative at a sight, robustly weighted.
 
-    `same` says that the host itself sees it. From `huber_k` on, of pixels and of depth, errors count less. The third
+    `same`: the host itself sees it. From `huber_k` on, of pixels and of depth, errors count less. The third
     row is filled where a depth is measured.
     """
     z = seen.in_cam[2]

@@ -43,7 +43,7 @@ class Landmarks(NamedTuple):
 
 
 def room_for(landmarks: int, width: int) -> Landmarks:
-    """Return room for so many landmarks, `width` K, with nothing in it yet."""
+    """Return uninitialised arrays for `landmarks` landmarks and `width` K."""
     shapes = ((3, 3), (3,), (3, width), (3, 3), (3,), (3, width))
     return Landmarks(*(np.empty((landmarks, *shape)) for shape in shapes))
 

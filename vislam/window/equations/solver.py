@@ -212,7 +212,7 @@ class _Equations:
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_prior(prior: Prior, dx: Array, where: Ints, A: Array, g: Array) -> None:
     """Add the prior at shift `dx` to the upper triangle of the normal equations A, g."""
-    touched = np.flatnonzero(np.diag(prior.H))  # of the others it says nothing: their rows and columns are zero
+    touched = np.flatnonzero(np.diag(prior.H))  # the others it does not constrain: their rows and columns are zero
     for i in touched:
         at = where[i]
         row = prior.H[i]
@@ -238,7 +238,7 @@ def move_calibration(calibration: Array, step: Array, active: NDArray[np.bool_])
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def moved_states(X: Array, step: Array, where: Ints) -> Array:
-    """Return the states [M, 21] after a step [D]; `where` [M, S] says which unknowns are whose."""
+    """Return the states [M, 21] after a step [D]; `where` [M, S] has the indices of each state's unknowns."""
     out = X.copy()
     d = np.empty(where.shape[1])
     for k in range(len(X)):

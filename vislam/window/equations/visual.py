@@ -169,7 +169,7 @@ def _add_own(ours: Array, host: int, poses_at: int, calibrated: int, normal: Nor
 def _add_seen(
     theirs: Array, host: int, seen: int, poses_at: int, calibrated: int, normal: Normal, cross: Array
 ) -> None:
-    """Add what a view says of the pose that sees, which is later than the host's, with all else that it hangs on."""
+    """Add a view's terms of the pose that sees, which is later than the host's, and of all else that it depends on."""
     A, g = normal
     for i in range(6):
         at = poses_at + seen + i
