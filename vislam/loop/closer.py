@@ -85,7 +85,7 @@ class LoopCloser:
 
     Whether a verified one is believed is for the graph to decide.
 
-    `gravity_aligned` says that the map's z axis is up (there is an IMU), so that a loop's tilt can be checked.
+    `gravity_aligned`: the map's z axis is up (there is an IMU), so that a loop's tilt can be checked.
     """
 
     def __init__(self, config: LoopConfig, rig: Rig, seed: int, gravity_aligned: bool = False) -> None:
@@ -192,7 +192,7 @@ class LoopCloser:
         self._submaps = update.submaps
 
     def _look_for_tags(self, keyframe: Keyframe) -> tuple[TagSighting, ...]:
-        """Return the tags in a keyframe's image; where nobody spoke of tags, few images are searched for the first."""
+        """Return the tags in a keyframe's image; until one is known or a size is set, few images are searched."""
         config = self._config
         is_looked_at = config.tag_size_m is not None or not self._tags.is_empty or keyframe.id % config.tags_every == 0
         return sight_tags(keyframe.frame, self._rig.cameras[0], config) if is_looked_at else ()
@@ -213,7 +213,7 @@ class LoopCloser:
         alike = _apart(self._alike(view), order, config.island_gap)[: wanted if config.max_appearance else 0]
         last = int(old[-1]) if len(old) else view.id
         if not self._submaps.are_joined(last, view.id) and self._submaps.are_tied(last, view.id):
-            order, near = order + near, []  # what was seen last before a loss tells where it went on
+            order, near = order + near, []  # after a loss, the keyframes just before it are likely to be near
             alike = _apart(alike, order, 0)
         near = _apart(near, alike, config.island_gap)
         for turn in range(max(len(near), len(alike))):

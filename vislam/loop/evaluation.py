@@ -130,7 +130,7 @@ class Curve:
 
 
 def precision_recall(found: Detections, revisits: NDArray[np.bool_]) -> Curve:
-    """Return the curve of a stage; `revisits` [N] says for which keyframes there is something to be found.
+    """Return the curve of a stage; `revisits` [N]: whether there is a loop to be found for a keyframe.
 
     Right answers count for precision wherever they are, for recall only at revisits. Doubtful ones count for neither.
     """

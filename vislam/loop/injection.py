@@ -25,7 +25,7 @@ class FalseLoops:
     """
 
     def __init__(self, share: float, group: int, seed: int, sigmas: ArrayLike = _SIGMAS) -> None:
-        """Make false loops `share` of all that are offered, in groups of so many; 1: each for itself.
+        """Make false loops `share` of all that are offered, in groups of `group`; 1: each for itself.
 
         `sigmas` [6], rotation first, in rad and m, are of the pose that a false loop claims.
         Raises UsageError for a share that is none, or a group of nothing.
@@ -44,7 +44,7 @@ class FalseLoops:
     def add(self, T_odom_body: Array, true: Sequence[LoopEdge]) -> list[LoopEdge]:
         """Take the next keyframe with the loops that were found with it; return the false ones to be offered as well.
 
-        `T_odom_body` [4, 4] only has to be right between near keyframes, and tell different places from one another.
+        `T_odom_body` [4, 4] only has to be right between near keyframes, and differ between different places.
         """
         self._poses.append(np.array(T_odom_body, dtype=np.float64))
         newest = len(self._poses) - 1
@@ -88,7 +88,7 @@ def is_injected(edge_id: int) -> bool:
 
 
 def as_candidate(edge: LoopEdge) -> LoopCandidate:
-    """Return the record of a false loop, which says what it is."""
+    """Return the record of a false loop, marked as injected."""
     return LoopCandidate(
         edge.from_id, edge.to_id, INJECTED, edge.score, edge.inliers, LoopDecision.ACCEPTED,
         "false, injected on purpose", sigma_m=float(np.sqrt(np.trace(edge.covariance[3:, 3:]) / 3.0)),

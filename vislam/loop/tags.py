@@ -1,6 +1,6 @@
-"""AprilTags as witnesses of a place: whoever sees a tag again is where it hangs.
+"""AprilTags as witnesses of a place: a keyframe that sees a tag again is where the tag hangs.
 
-Without a known size a tag only says which keyframes to compare; with one, its four corners also give the relative pose
+Without a known size a tag only selects keyframes to compare; with one, its four corners also give the relative pose
 where there is too little else to match. Pose by IPPE (Collins and Bartoli, IJCV 2014), which yields two solutions for a
 plane: where both fit the corners, none is taken.
 """
@@ -23,7 +23,7 @@ _MIN_CHI2_APART = 25.0  # of the two solutions' residuals; nearer, and noise may
 
 
 def sight_tags(frame: Frame, camera: Camera, config: LoopConfig) -> tuple[TagSighting, ...]:
-    """Return the tags that cam0 of a frame sees; one that is seen twice in an image tells nothing and is left out."""
+    """Return the tags that cam0 of a frame sees; one that is seen twice in an image is ambiguous and left out."""
     if config.tags == "off" or not frame.images:
         return ()
     ids, corners_px = find_tags(frame.images[0], config.tags, _MIN_SIDE_PX)

@@ -1,7 +1,7 @@
-"""Whether two views may show the same place, told by their matches alone and at a fraction of what a pose costs.
+"""Whether two views may show the same place, by their matches alone and at a fraction of what a pose costs.
 
-Words say which keyframes look most alike, not whether any is alike: where nothing was seen before, the most alike is a
-wrong one. Matched points with depth tell: distances between points of one rigid scene are the same in both views,
+Words rank keyframes by likeness but do not decide whether any is alike: in a new place the most alike is a wrong one.
+Matched points with depth decide: distances between points of one rigid scene are the same in both views,
 wherever these stand (Bailey et al., ICRA 2000), and wrong matches hardly ever keep more than four of them together.
 """
 
@@ -51,9 +51,9 @@ class Likeness:
 def compare(a: View, b: View, config: LoopConfig, px: float) -> Likeness:
     """Match two views and say whether they are alike; `px` is one pixel on the plane z = 1.
 
-    Where there is enough depth to tell, `min_rigid` matches have to keep their distances. Without it, their number has
-    to be three sigmas (Poisson) above what chance gives; twice that is enough in any case, since points that lie close
-    together, as on a picture far away, tell nothing by their distances.
+    Where enough matches have depth, `min_rigid` of them have to keep their distances. Without, their number has to be
+    three sigmas (Poisson) above what chance gives; twice that is enough in any case, since distances between points
+    that lie close together, as on a picture far away, carry no information.
     """
     pairs = match(a.descriptors, b.descriptors, _MATCH_RATIO, MATCH_MAX_DISTANCE)
     chance = config.chance_matched_share * min(len(a.xy), len(b.xy))

@@ -110,7 +110,7 @@ def relative_direction(xy_a: Array, xy_b: Array, limit: float, seed: int) -> Dir
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_a[inliers], axis=1)
     plane = _plane_share(xy_a[inliers], xy_b[inliers], 2.0 * limit, seed)
-    # keypoints scatter less than a limit made for the worst of them says, too
+    # most keypoints scatter less than the limit, which is made for the worst of them
     scatter = np.median(epipolar_distances(T_a_b, xy_a, seen)[inliers] ** 2) / (_MEDIAN_CHI2_1 * sigma**2)
     covariance = found.covariance * scatter / max(1.0, found.variance)
     return Direction(T_a_b, in_b @ covariance @ in_b.T, inliers, float(np.nanmedian(shift)), plane)
@@ -330,7 +330,7 @@ def _agreeing(T_a_b: Array, matched: Matched, limit: float) -> NDArray[np.bool_]
 
 
 def _agreements(T_a_b: Array, matched: Matched, limit: float, limit_inverse_m: float) -> tuple[float, float]:
-    """Return which share of the matches agrees the other way round, and in depth; NaN when too few can tell."""
+    """Return which share of the matches agrees the other way round, and in depth; NaN when too few have depth."""
     forward, reverse, depth = errors(T_a_b, matched)
     both = np.isfinite(matched.points_a[:, 2]) & np.isfinite(matched.points_b[:, 2])
     either = both & (np.fmin(forward, reverse) <= limit)
@@ -353,7 +353,7 @@ def judge(found: Verification, tilt_rad: float | None) -> tuple[LoopDecision, st
     """Return whether a candidate is offered to the graph, by its verification and its tilt (None: unknown), and why.
 
     Enough inliers alone do not do: what remains wrong after PnP is the right place with a bad pose, or an object that
-    exists twice. The first shows in its own measurement; which of two places it is, only the graph can tell.
+    exists twice. The first shows in its own measurement; which of two places it is, only the graph can decide.
     """
     if found.T_a_b is None:
         return LoopDecision.REJECTED, found.reason

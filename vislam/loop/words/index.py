@@ -27,7 +27,7 @@ Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
 
 _START, _FILL, _ROOM, _LAST = 0, 1, 2, 3  # of a list: place and room in cells, entries, newest slot
-_SKIP = 0xFFFF  # an entry that only says how far it is to the next one
+_SKIP = 0xFFFF  # an entry that only has the distance to the next one
 _COUNT_BITS = 12  # of an entry with a count
 _MAX_COUNT = 2**_COUNT_BITS - 1  # what one image has more often of one word counts as so often
 _MAX_SLOTS = 2 ** (32 - _COUNT_BITS)  # a million keyframes: the largest distance that fits beside a count
@@ -57,7 +57,7 @@ def _cells_needed(slot: int, words: Int32s, counts: Int32s, lists: Int64s) -> in
 
 @njit(cache=True, nogil=True)
 def _make_room(row: int, cells: int, lists: Int64s, pool: NDArray[np.uint32], free: Int64s, used: int) -> int:
-    """Move a list into an area of at least so many cells; return how much of the pool is used afterwards."""
+    """Move a list into an area of at least `cells` cells; return how much of the pool is used afterwards."""
     old, room = lists[row, _ROOM], max(1, lists[row, _ROOM])
     while room < cells:
         room *= 2
@@ -242,7 +242,7 @@ class InvertedIndex:
         self._count += 1
 
     def _grow(self, cells: int) -> None:
-        """Have room for a keyframe more and so many cells. Growing in place, a large pool is remapped, not copied."""
+        """Have room for one more keyframe and `cells` cells. Growing in place, a large pool is remapped, not copied."""
         if cells > len(self._pool):
             if cells > _MAX_CELLS or self._count >= _MAX_SLOTS:
                 raise ValueError(f"an index of {self._count} keyframes and {cells} cells is full")

@@ -1,6 +1,6 @@
 """Reading a vocabulary from ORB-SLAM's text format (DBoW2's `saveToTextFile`, such as ORBvoc.txt).
 
-The first line says `k L scoring weighting`; every other line is a node: its parent (0: the root; nodes are numbered by
+The first line is `k L scoring weighting`; every other line is a node: its parent (0: the root; nodes are numbered by
 line, from 1), whether it is a leaf, its 32 bytes, its weight. Only L1 scores of tf-idf weights (0 0) mean what they
 mean here.
 """
@@ -150,7 +150,7 @@ def _parse(
 
 
 def read_orbslam(path: Path) -> Vocabulary:
-    """Read a vocabulary in ORB-SLAM's text format; words are numbered anew, scores are the same.
+    """Read a vocabulary in ORB-SLAM's text format; words get other numbers, scores are the same.
 
     Raises DataError, with the line, for a file that is not one or was damaged.
     """

@@ -252,7 +252,7 @@ def weigh(
     weights = np.zeros(len(ordered))
     count, total = 0, 0.0
     for word in ordered:
-        if idf[word] <= 0.0:  # a word that every image has tells nothing
+        if idf[word] <= 0.0:  # a word that every image has carries no information
             continue
         if count == 0 or unique[count - 1] != word:
             unique[count] = word

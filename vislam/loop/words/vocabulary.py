@@ -1,4 +1,4 @@
-"""The vocabulary: which of some thousand words a descriptor is, and how much each word tells about a place.
+"""The vocabulary: which of some thousand words a descriptor is, and how informative each word is of a place.
 
 tf-idf weights and the L1 score are those of DBoW2 (Galvez-Lopez and Tardos, "Bags of binary words for fast place
 recognition in image sequences", T-RO 2012). Where vocabularies come from: `database.py`.
@@ -130,7 +130,7 @@ class Vocabulary:
 
 
 def depth_for(descriptors: int, branching: int, most: int) -> int:
-    """Return how many levels leave each word at least five of so many descriptors: 1 to `most`.
+    """Return how many levels leave each word at least five of the descriptors: 1 to `most`.
 
     Words that are rarer know their training images by heart and nothing else (measured: benchmarks/RESULTS.md).
     """
