@@ -98,7 +98,7 @@ def _help() -> str:
     lines += ["", "examples:"] + [f"  {verb.example}" for verb in VERBS.values()]
     lines += [
         "",
-        "vislam --version; --log-level debug, info, warning or error says what log.txt of a run folder keeps.",
-        "vislam VERB --help tells the rest. Exit codes: 0 done, 2 usage, 3 data, 4 tracking lost, 5 hardware.",
+        "vislam --version; --log-level debug, info, warning or error sets what log.txt of a run folder keeps.",
+        "vislam VERB --help has the rest. Exit codes: 0 done, 2 usage, 3 data, 4 tracking lost, 5 hardware.",
     ]
     return "\n".join(lines)

@@ -14,7 +14,7 @@ __all__ = ["VERBS", "Verb"]
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """What --help says of a verb."""
+    """What --help shows of a verb."""
 
     summary: str
     example: str
@@ -35,7 +35,7 @@ _VERBS = {
         "vislam simulate corridor-loop --out recordings/corridor",
     ),
     "eval": Verb("compare a trajectory with the truth", "vislam eval runs/desk"),
-    "compare": Verb("compare estimators as a plan says", "vislam compare experiments/ekf_vs_graph.toml"),
+    "compare": Verb("compare estimators by a plan", "vislam compare experiments/ekf_vs_graph.toml"),
     "doctor": Verb(
         "say what is wrong with a recording, or with the sensors of this machine",
         "vislam doctor euroc:PATH; vislam doctor --i2c /dev/i2c-1 --camera 0",

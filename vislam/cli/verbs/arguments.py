@@ -29,7 +29,7 @@ def parse(
 ) -> Options:
     """Parse the arguments of a verb into its options; wrong ones leave with exit code 2, --help with 0.
 
-    With `brief`, --help tells what people change and --help-all the rest. Raises UsageError for a number out of range.
+    With `brief`, --help has the usual options and --help-all the rest. Raises UsageError for a number out of range.
     """
     if brief is not None and {"-h", "--help"} & {*arguments}:
         print(brief_help(verb, options, brief))
@@ -54,7 +54,7 @@ def parse(
 
 
 def _in_one_line(box: str, verb: str) -> str:
-    """Return what the parser of arguments says, without the box that it draws around it, its title and its advice."""
+    """Return the message of the parser of arguments, without the box around it, its title and its advice."""
     _, *lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in box.splitlines()] or [""]
     said = " ".join(line for line in lines if line and not line.endswith("--help"))
     said = re.split(r" ?(?:Got errors:|Argument helptext:|For full helptext)", said)[0].rstrip(".")

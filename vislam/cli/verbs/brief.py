@@ -26,7 +26,7 @@ _NARROWEST = 80
 
 @dataclass(frozen=True, slots=True)
 class Brief:
-    """What the short help of a verb tells.
+    """Contents of a verb's short help.
 
     Attributes:
         usage: after `vislam VERB`.
@@ -57,7 +57,7 @@ def brief_help(verb: str, options: type, brief: Brief) -> str:
 
 
 def said_of(setting: Setting) -> str:
-    """Return what the source says of a setting: behind it, in the lines above it, or in the string below it."""
+    """Return a setting's description in the source: behind it, in the lines above it, or in the string below it."""
     name = re.escape(setting.path[-1])
     owner = next(cls for cls in setting.owner.__mro__ if setting.path[-1] in vars(cls).get("__annotations__", {}))
     source = inspect.getsource(owner)

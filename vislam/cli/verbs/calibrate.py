@@ -14,7 +14,7 @@ def main(arguments: list[str]) -> int:
     """Calibrate what the first argument names."""
     if not arguments or arguments[0] in ("-h", "--help"):
         lines = [f"  {name:<12}{kind.summary}" for name, kind in KINDS.items()]
-        usage = "usage: vislam calibrate WHAT ...; vislam calibrate WHAT --help tells more"
+        usage = "usage: vislam calibrate WHAT ...; vislam calibrate WHAT --help has more"
         print("\n".join([usage, "", *lines]))
         return 0 if arguments else UsageError.exit_code
     kind = KINDS.get(arguments[0])

@@ -1,4 +1,4 @@
-"""`vislam compare`: estimators against each other, as a plan says."""
+"""`vislam compare`: estimators against each other, by a plan."""
 
 import json
 

@@ -35,7 +35,7 @@ class DoctorOptions:
     imu: str | None = None
     """This IMU must give samples, as `vislam live` names it: board, lsm6dsox:/dev/i2c-1, realsense ..."""
     serial: str | None = None
-    """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that nobody names are not opened"""
+    """A serial bridge must be on this port, such as /dev/ttyUSB0; ports that are not named are not opened"""
     camera: str | None = None
     """This camera must give images: its index or device file, picam, realsense, oak"""
     masks: str | None = None

@@ -39,7 +39,7 @@ class PageOptions:
     web: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[HOST:PORT]")] = None
     """A page that shows and steers the run; 127.0.0.1:8765 where nothing else is said"""
     web_waits: bool = False
-    """With --web: begin when the page says so; until then it can calibrate"""
+    """With --web: begin when the page asks for it; until then it can calibrate"""
     web_host: Annotated[UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
     """With --web: a further name that the page may be asked for by, such as that of a tunnel"""
 
@@ -67,8 +67,8 @@ def opened(page: PageOptions, pose_name: str, out: Path) -> Iterator[Station | N
         print(f"vislam: the page of this run: {station.url}", file=sys.stderr, flush=True)
         if not at.is_loopback:
             print(
-                f"vislam: others can reach {station.address} (with this machine's address where that is none); whoever "
-                "has the token steers the run, and what is sent can be read on the way: a tunnel is safer "
+                f"vislam: others can reach {station.address} (with this machine's address where that is none); all who "
+                "have the token can steer the run, and what is sent can be read on the way: a tunnel is safer "
                 "(docs/cart.md)", file=sys.stderr, flush=True,
             )  # fmt: skip
         with station.noticing():
@@ -80,10 +80,10 @@ def opened(page: PageOptions, pose_name: str, out: Path) -> Iterator[Station | N
 def begun_by_page(
     station: Station, options: LiveOptions, command: list[str], make: Callable[[LiveOptions], Made]
 ) -> tuple[Made, LiveOptions]:
-    """Wait until the page says that the run shall begin, and return what `make` makes of the options, and those.
+    """Wait until the page begins the run, and return what `make` makes of the options, and those.
 
     Meanwhile the page can calibrate: the options then have what was found. Where it cannot be made, as where a sensor
-    is missing, the page says why and it may be tried again.
+    is missing, the page shows why and it may be tried again.
 
     Raises VislamError: the process of the page died.
     """

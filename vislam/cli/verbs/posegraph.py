@@ -21,7 +21,7 @@ class PoseGraphOptions:
     """Options of `vislam posegraph FILE`: a pose graph in g2o, TORO or iSAM format."""
 
     file: Positional[Path]
-    """Pose graph; what is no format's ending .g2o, .toro or .isam is told by its contents"""
+    """Pose graph; a file that does not end in .g2o, .toro or .isam is recognised by its contents"""
     settings: Annotated[PoseGraphConfig, tyro.conf.arg(name="")] = field(default_factory=PoseGraphConfig)
     solving: Annotated[SolvingOptions, tyro.conf.arg(name="")] = field(default_factory=SolvingOptions)
     out: Path | None = None

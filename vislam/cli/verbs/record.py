@@ -21,9 +21,9 @@ class RecordOptions:
     """Folder to make for the recording (ASL layout)"""
     imu: str = "gy85"
     """gy85[:/dev/i2c-1], board[:/dev/i2c-1] (whichever chip answers) or a chip's name, serial[:/dev/ttyUSB0] (without
-    a path as the settings say), realsense or oak (the one inside the camera of that name), or none"""
+    a path as in the settings), realsense or oak (the one inside the camera of that name), or none"""
     camera: str = "webcam"
-    """Index, /dev/v4l/by-id/..., webcam (as --webcam.device says), picam[:0] (the Raspberry Pi's own),
+    """Index, /dev/v4l/by-id/..., webcam (that of --webcam.device), picam[:0] (the Raspberry Pi's own),
     realsense or oak with :SERIAL, then ,depth behind it as wanted (stereo, or colour and depth), a video file in place
     of a camera, or none"""
     seconds: Positive | None = None

@@ -26,7 +26,7 @@ class SimulateOptions:
     further_cameras: Whole = 0
     """Beside those, evenly around the vertical, at most 6"""
     duration_s: Positive | None = None
-    """Only the first so many seconds"""
+    """Length from the world's start in seconds; None: all of it"""
     camera_hz: Positive | None = None
     """Frames per second; None: what the world has"""
     image_width_px: Count = 640

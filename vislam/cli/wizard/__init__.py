@@ -1,1 +1,1 @@
-"""Calibration in the page of a live run that waits: sensors, steps, and what browsers are told of them."""
+"""Calibration in the page of a live run that waits: sensors, steps, and what browsers get of them."""

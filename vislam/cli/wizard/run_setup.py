@@ -54,7 +54,7 @@ class RunSetup:
             iron = read_mag_calibration(path)
             told = replace(told, mag_bias_ut=_vector(iron.bias_ut), mag_matrix=_matrix(iron.matrix))
         sensors = with_calibration(inertial, self.sensors, told)
-        return replace(self, sensors=sensors), "the run begins with it, in place of what the sensors file says"
+        return replace(self, sensors=sensors), "the run begins with it, in place of that in the sensors file"
 
     def _with_file(self, kind: str, path: Path) -> tuple[RunSetup, str]:
         files = replace(self.config.calibration, **{_NAMES[kind]: str(path)})
@@ -70,7 +70,7 @@ class RunSetup:
         return other, use
 
     def _with_camera(self, camera: str, path: Path) -> tuple[RunSetup, str]:
-        """Put the new lens where the camera's file says that it sits; a board does not tell that."""
+        """Put the new lens at the pose in the camera's file, which a board does not give."""
         if gives_frames(camera):
             return self, f"the run begins with its maker's calibration: {camera} has several cameras"
         before = self.config.calibration.camera

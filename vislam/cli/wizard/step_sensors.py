@@ -74,7 +74,7 @@ class CartSensors:
 
 
 class PlayedSensors:
-    """A recording in real time; frames that nobody took in time are left out."""
+    """A recording in real time; frames that are not taken in time are left out."""
 
     def __init__(self, uri: str, config: Config, has_images: bool) -> None:
         """Begin to play; raises HardwareError where there is nothing to play."""
