@@ -25,13 +25,13 @@ class ImuNoise:
     gyroscope_scale_sigma: float | None = None
     accelerometer_scale_sigma: float | None = None
 
-    def gap_s(self, told_s: float) -> float:
+    def gap_s(self, stated_s: float) -> float:
         """Return how long a hole between samples is no outage: as given, and one and a half periods of a slow IMU.
 
         Not beyond half a second: what a body does between samples further apart is unmeasured.
         """
         usual_s = _USUAL_PERIODS / self.rate_hz if self.rate_hz > 0.0 else 0.0
-        return max(told_s, usual_s) if usual_s <= _LONGEST_GAP_S else told_s
+        return max(stated_s, usual_s) if usual_s <= _LONGEST_GAP_S else stated_s
 
 
 def _zero() -> Array:

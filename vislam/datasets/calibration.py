@@ -111,7 +111,7 @@ class Keys(dict[str, Any]):
                 f"{path}: not read: {_listed(weighty)}; without it a place, clock or scale would be wrong: write "
                 f"{instead}, or remove it"
             )
-        if unused := [key for key, value in rest.items() if not says_nothing(value)]:
+        if unused := [key for key, value in rest.items() if not is_neutral(value)]:
             warn_once(f"{path}: not used: {_listed(unused)}")
 
 
@@ -365,7 +365,7 @@ def numbers_in(data: Mapping[str, Any], key: str, path: Path, count: int | None 
     return numbers
 
 
-def says_nothing(value: Any) -> bool:
+def is_neutral(value: Any) -> bool:
     """Return whether a value is none, zero, one or an identity: not to use it changes nothing."""
     try:
         flat = np.array(_flat(value["data"] if isinstance(value, dict) else value), dtype=np.float64)

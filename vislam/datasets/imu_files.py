@@ -15,7 +15,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.datasets.calibration import NOISE_KEYS, SCALE_KEYS, Keys, load_yaml, numbers_in, parse_noise, says_nothing
+from vislam.datasets.calibration import NOISE_KEYS, SCALE_KEYS, Keys, is_neutral, load_yaml, numbers_in, parse_noise
 from vislam.datasets.calibration_text import list_text
 from vislam.datasets.foreign_cameras import load_keys
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
@@ -70,7 +70,7 @@ def read_noise(path: Path, topic: str = "") -> ImuNoise:
         data.name_unused(path, known=nested)
         data = Keys(data[chosen[0]])
     noise = parse_noise(data, "update_rate" if "update_rate" in data else "rate_hz", path)
-    data.name_unused(path, _INSTEAD, known=("model", *(key for key, value in data.items() if says_nothing(value))))
+    data.name_unused(path, _INSTEAD, known=("model", *(key for key, value in data.items() if is_neutral(value))))
     return noise
 
 

@@ -69,7 +69,7 @@ class _Begun:
     """A sensor whose own variables have first values."""
 
     guess: Array  # [V]
-    told: Array  # [V], with `units` as sigmas: readings before it are known by this alone
+    given: Array  # [V], with `units` as sigmas: readings before it are known by this alone
     units: Array  # [V]
     first: int = -1  # number of the first entry
     constant: set[int] = field(default_factory=set)  # numbers of variables that do not change and have their key
@@ -353,7 +353,7 @@ def _ties(entry: _Entry, begun: _Begun | None, variables: Sequence[Variable]) ->
     """Return the priors of variables that are new, and the walks of those that are not."""
     if begun is None:
         return []
-    told, units = (begun.told / begun.units).tolist(), begun.units.tolist()
+    given, units = (begun.given / begun.units).tolist(), begun.units.tolist()
     out: list[gtsam.NonlinearFactor] = []
     for n, (variable, unit) in enumerate(zip(variables, units, strict=True)):
         earlier = entry.earlier[n]
@@ -368,7 +368,7 @@ def _ties(entry: _Entry, begun: _Begun | None, variables: Sequence[Variable]) ->
             # what walks and begins again with a submap has walked an unknown way since its value was given
             sigma = 1.0 if entry.number == begun.first else max(variable.sigma / unit, 1.0)
             model = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-            out.append(gtsam.PriorFactorDouble(entry.keys[n], told[n], model))
+            out.append(gtsam.PriorFactorDouble(entry.keys[n], given[n], model))
     return out
 
 

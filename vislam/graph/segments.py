@@ -169,8 +169,8 @@ def summarised(
     carry = -spread @ H[:own, own:]
     cross = carry @ known
     joint = np.block([[spread + cross @ carry.T, cross], [cross.T, known]])
-    told, shift = H[own:, own:] + H[own:, :own] @ carry, eta[own:] + carry.T @ eta[:own]
-    return Summary(_tree(told, shift, around, poses), _stands(joint, segment, around, poses))
+    information, shift = H[own:, own:] + H[own:, :own] @ carry, eta[own:] + carry.T @ eta[:own]
+    return Summary(_tree(information, shift, around, poses), _stands(joint, segment, around, poses))
 
 
 def joint_beside(stands: Mapping[int, Stand], keys: list[int], solved: Callable[[list[int]], Array]) -> Array:
@@ -192,14 +192,14 @@ def joint_beside(stands: Mapping[int, Stand], keys: list[int], solved: Callable[
     return np.asarray(carry @ known @ carry.T + own)
 
 
-def _tree(told: Array, shift: Array, ids: list[int], poses: Mapping[int, Array]) -> dict[tuple[int, int], Link]:
-    """Return relative poses between keyframes, by the information `told` [6 A, 6 A] on them and its vector `shift`.
+def _tree(information: Array, shift: Array, ids: list[int], poses: Mapping[int, Array]) -> dict[tuple[int, int], Link]:
+    """Return relative poses between keyframes, by their `information` [6 A, 6 A] and its vector `shift`.
 
     They make the tree of the surest ones. What two of them err in common is lost, as in the tree of Chow and Liu that
     Carlevaris-Bianco et al. keep ("Generic node removal for factor-graph SLAM", T-RO 2014).
     """
-    covariance = np.zeros(told.shape)  # where the first stays
-    covariance[6:, 6:] = np.linalg.inv(told[6:, 6:])
+    covariance = np.zeros(information.shape)  # where the first stays
+    covariance[6:, 6:] = np.linalg.inv(information[6:, 6:])
     steps = covariance @ shift
     moved = {k: poses[k] @ se3_exp(steps[6 * n : 6 * n + 6]) for n, k in enumerate(ids)}
     pairs: dict[tuple[int, int], tuple[float, Array]] = {}

@@ -149,7 +149,7 @@ class MotionWitness:
             self.turns.append((R_gyro, R_seen))
         may_rad = _TURN_RAD if is_metric else _MISTAKEN * _TURN_RAD
         off, is_calm = self._off(off_rad, self._turns_rad, may_rad + _TURN_SHARE * turn_rad)
-        tells = turn_rad > 2.0 * _TURN_RAD
+        is_informative = turn_rad > 2.0 * _TURN_RAD
         if first == 0:
             gravity, own_m_s2 = _gravity(self._frames, middle) if is_metric else (_mean_gravity(self._frames), 0.0)
             if self._gravity:
@@ -157,13 +157,13 @@ class MotionWitness:
                 may_m_s2 = _FORCE_M_S2 + _FORCE_SHARE * own_m_s2 if is_metric else _UNSEEN_M_S2
                 times = _UNUSUAL if is_metric else _UNSEEN
                 by_force, is_force_calm = self._off(off_m_s2, self._forces_m_s2, may_m_s2, times)
-                off, is_calm, tells = max(off, by_force), is_calm and is_force_calm, True
+                off, is_calm, is_informative = max(off, by_force), is_calm and is_force_calm, True
             if off <= 1.0 and self.until_ns is None:
                 self._gravity.append(gravity)
         if is_calm:
             self._calm_ns = self._frames[-1].t_ns, self._frames[-2].t_ns
         if off <= 1.0:
-            self._agree(tells)
+            self._agree(is_informative)
         else:
             self._contradict(min(off, _MOST_WEIGHT))
 
@@ -182,9 +182,9 @@ class MotionWitness:
     def _vote_s(self) -> float:
         return min((self._frames[-1].t_ns - self._frames[-2].t_ns) / _NS, _VOTE_S)
 
-    def _agree(self, tells: bool) -> None:
-        self._is_vision_doubted = self._is_vision_doubted and not tells
-        self._against_s = max(self._against_s - self._vote_s * tells, 0.0)
+    def _agree(self, is_informative: bool) -> None:
+        self._is_vision_doubted = self._is_vision_doubted and not is_informative
+        self._against_s = max(self._against_s - self._vote_s * is_informative, 0.0)
         if self._against_s == 0.0:
             self.until_ns = None
 

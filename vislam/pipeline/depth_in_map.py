@@ -25,7 +25,7 @@ from vislam.trajectory.odometry_keyframe import OdometryKeyframe
 RelativeCovariance = Callable[[int, int], Array]  # of T_i_j [6, 6], perturbed at j
 
 _LEAST_M, _LEAST_DEG = 0.05, 3.0  # of a guess's standard deviations: where several starts are to end in one place
-_TOLD_M, _TOLD_DEG = 0.3, 15.0  # of a pose given by the user: "near the charging station"
+_GIVEN_M, _GIVEN_DEG = 0.3, 15.0  # of a pose given by the user: "near the charging station"
 _DRIFT = 0.05  # of the way since then: odometry that nothing holds
 _MOST_M, _MOST_DEG = 0.5, 20.0  # farther off, depth was measured to find false places
 
@@ -53,8 +53,8 @@ class DepthInMap:
         self._numbers = {k: n for n, k in enumerate(self._ids)}
         self._poses = {k: poses[k] for k in self._ids}
         self._submaps = submaps
-        self._told = memory.T_guess
-        self._T_map_odom_told: Array | None = None
+        self._given = memory.T_guess
+        self._T_map_odom_given: Array | None = None
         self._way_m, self._T_odom_before = 0.0, np.eye(4)
         self._since_s, self._t_ns_before = 0.0, 0  # from the keyframe before to the newest
         self._T_body_cam = rig.T_body_cams[0]
@@ -63,7 +63,7 @@ class DepthInMap:
 
     def guess(self, T_map_body: Array) -> None:
         """Take where the body is about now, [4, 4], at the next keyframe; it counts where the place is not known."""
-        self._told, self._way_m = T_map_body, 0.0
+        self._given, self._way_m = T_map_body, 0.0
 
     def move(self, update: GraphUpdate) -> None:
         """Follow the keyframes that the graph moved, and the submaps that it joined."""
@@ -116,8 +116,8 @@ class DepthInMap:
         count = last.in_a_row + 1 if agrees and last is not None else 1
         self._last = _Last(k, answer, count)
         candidate = Candidate(candidate.id, candidate.source, candidate.score, count - 1)
-        if agrees and self._T_map_odom_told is not None:
-            self._T_map_odom_told, self._way_m = answer.T_map_body @ invert(T_odom_body), 0.0
+        if agrees and self._T_map_odom_given is not None:
+            self._T_map_odom_given, self._way_m = answer.T_map_body @ invert(T_odom_body), 0.0
         if count < wanted:
             self.counters["alone"] += 1
             return candidate, Verification(f"by depth: {count} of {wanted} keyframes in a row agree", 0)
@@ -143,11 +143,11 @@ class DepthInMap:
         k = packet.keyframe.id
         is_joined = not packet.begins_submap and self._submaps.group(k) == 0
         if not is_joined:
-            if self._T_map_odom_told is None:
+            if self._T_map_odom_given is None:
                 return None
-            sigma_m = _TOLD_M + _DRIFT * self._way_m
-            return Guess(self._T_map_odom_told @ T_odom_body, sigma_m, _TOLD_DEG) if sigma_m <= _MOST_M else None
-        self._T_map_odom_told = None  # loops know better
+            sigma_m = _GIVEN_M + _DRIFT * self._way_m
+            return Guess(self._T_map_odom_given @ T_odom_body, sigma_m, _GIVEN_DEG) if sigma_m <= _MOST_M else None
+        self._T_map_odom_given = None  # loops know better
         T_map_body = T_map_odom @ T_odom_body
         near = self._localiser.nearest(T_map_body)
         if near < 0 or packet.vo.T_keyframe_body is None:
@@ -179,10 +179,10 @@ class DepthInMap:
         """Carry on the pose given for the first keyframe, and the time; a loss of track ends the former."""
         T_odom_body, t_ns = odometry.T_odom_body, odometry.packet.keyframe.t_ns
         self._since_s, self._t_ns_before = (t_ns - self._t_ns_before) * 1e-9, t_ns
-        if self._told is not None:
-            self._T_map_odom_told, self._told = self._told @ invert(T_odom_body), None
+        if self._given is not None:
+            self._T_map_odom_given, self._given = self._given @ invert(T_odom_body), None
         elif odometry.packet.begins_submap:
-            self._T_map_odom_told = None
+            self._T_map_odom_given = None
         else:
             self._way_m += float(np.linalg.norm(T_odom_body[:3, 3] - self._T_odom_before[:3, 3]))
         self._T_odom_before = T_odom_body

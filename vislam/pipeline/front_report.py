@@ -58,7 +58,7 @@ class FrontReport:
     scaled_from_ns: int | None = None  # before, poses of one camera have no scale; None: all have
     noise_ratios: NoiseRatios | None = None  # white noise seen over that of the model; None without an IMU
     condition: InertialCondition | None = None  # of the IMU; None without one
-    told_noise: ImuNoise | None = None  # of the IMU
+    stated_noise: ImuNoise | None = None  # of the IMU
     track_noise: dict[str, Any] = field(default_factory=dict)  # of pixels: what tracks showed, and what was used for it
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # further ones, see `ReadingIntake.report`
     shared_errors: Mapping[str, tuple[float, tuple[float, ...], float]] = field(default_factory=dict)  # by the filter
@@ -209,7 +209,7 @@ def report_of(front: Front) -> FrontReport:
     events = [*front.watch.feed.events, *([] if imu is None else imu.buffer.events)]
     report = FrontReport(
         front.frontend.mode, None, front.start, begun.refusal, _counters(front), {}, [], {},
-        front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, told_noise=front.noise,
+        front.watch.uniform.longest_s, _learned_of_camera(front), begun.scaled_from_ns, stated_noise=front.noise,
         track_noise=front.watch.tracks.summary(_given_px(front)),
         sensors=_sensors(front),
         first_t_ns=front.watch.feed.first_t_ns or 0, lost_reason=front.watch.lost_reason,

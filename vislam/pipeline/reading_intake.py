@@ -158,7 +158,7 @@ class ReadingIntake:
                 self.counters[reading.sensor]["unusable"] += 1
             elif reading.sensor in self._beginning:
                 self._compare(reading)
-            elif self._tell_filter(reading):
+            elif self._give_to_filter(reading):
                 self._queue(self._since, reading, _MAX_SINCE, "crowded")
 
     def pack(self, packet: KeyframePacket, before_t_ns: int, state: NavState | None) -> KeyframePacket:
@@ -188,7 +188,7 @@ class ReadingIntake:
         begun = [name for name in self._suite.names if name not in self._beginning]
         return _with_motions(packet, self._suite, begun, state, self._filter.ekf.own)
 
-    def _tell_filter(self, reading: Reading) -> bool:
+    def _give_to_filter(self, reading: Reading) -> bool:
         """Give the filter a reading unless its wheels slip; return whether the graph shall have it as well."""
         if self._filter is None:
             return True
@@ -221,7 +221,7 @@ class ReadingIntake:
         try:
             return self._suite.why_unusable(reading)
         except USER_ERRORS as error:
-            return f"its check failed: {_told(error)}"
+            return f"its check failed: {_reason(error)}"
 
     def _queue(self, queue: deque[Reading], reading: Reading, most: int, left_as: str) -> None:
         queue.append(reading)
@@ -274,7 +274,7 @@ class ReadingIntake:
         try:
             return _first_values(name, self._suite[name], beginning)
         except USER_ERRORS as error:
-            self.notes[name] = f"left out, it cannot begin: {_told(error)}"
+            self.notes[name] = f"left out, it cannot begin: {_reason(error)}"
             self._left_out.add(name)
             beginning.readings.clear()
             beginning.bodies.clear()
@@ -371,7 +371,7 @@ def _with_motions(
     return replace(packet, readings=tuple(rest), motions=tuple(motions))
 
 
-def _told(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 

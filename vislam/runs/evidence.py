@@ -95,7 +95,7 @@ def front_evidence(report: FrontReport, machine: MachineConfig) -> Evidence:
         driven=tuple(_driven(name, entry) for name, entry in report.sensors.items() if "stated" in entry),
         **_calibration(report.calibration),
     )
-    condition, noise, given = report.condition, report.noise_ratios, report.told_noise
+    condition, noise, given = report.condition, report.noise_ratios, report.stated_noise
     if condition is None or given is None:
         return evidence
     return replace(

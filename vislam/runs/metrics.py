@@ -106,8 +106,8 @@ def sensors_entry(
             "filter": both | _in_filter(name, came, counters.get("ekf", {})),
             "graph": both | _slipped(came) | _in_graph(came, {} if graph is None else graph.sensed(name), since),
         }
-        told_here = {key: value for key, value in entry.items() if key not in {"queued", "since_keyframe"}}
-        out[name] = {**told_here, "readings": readings}
+        shown = {key: value for key, value in entry.items() if key not in {"queued", "since_keyframe"}}
+        out[name] = {**shown, "readings": readings}
     return out
 
 

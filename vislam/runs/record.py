@@ -44,7 +44,7 @@ from vislam.runs.recorded_readings import FurtherPorts, ReadingRecorder
 _GB = 1e9
 _READ_S = 0.2  # a reading thread looks so often whether to stop
 _WRITE_S = 0.05  # inertial samples wait at most so long for an image that does not come
-_TOLD_S = 1.0  # between looks at the free space, and lines of progress
+_LOOK_EVERY_S = 1.0  # between looks at the free space, and lines of progress
 _JOIN_S = 2.0
 _SAMPLES = 8000  # that may wait for the disk: 18 s at 450 Hz
 _FIRST_IMAGE_S = 5.0
@@ -206,12 +206,12 @@ class _Recording:
                 self._write_frame(first)
             for thread in threads:
                 thread.start()
-            told_s = time.monotonic()
+            looked_s = time.monotonic()
             while not recorded.ended:
                 self._write_waiting(_WRITE_S)
                 recorded.ended = self._why_end(seconds)
-                if time.monotonic() - told_s > _TOLD_S or recorded.ended:
-                    told_s = time.monotonic()
+                if time.monotonic() - looked_s > _LOOK_EVERY_S or recorded.ended:
+                    looked_s = time.monotonic()
                     self._take_stock()
                     if progress is not None:
                         progress(recorded)

@@ -250,8 +250,8 @@ def _with_known(
     if unknown := [name for name in known if name not in names]:
         there = f"there are: {', '.join(names)}" if names else "it has none"
         raise UsageError(f"{where}: option known: no own variable {unknown[0]!r} with these settings; {there}")
-    as_told = [known.get(variable.name, (variable.start, variable.sigma)) for variable in variables]
-    return tuple(v._replace(start=start, sigma=sigma) for v, (start, sigma) in zip(variables, as_told, strict=True))
+    stated = [known.get(variable.name, (variable.start, variable.sigma)) for variable in variables]
+    return tuple(v._replace(start=start, sigma=sigma) for v, (start, sigma) in zip(variables, stated, strict=True))
 
 
 def _file(common: _Common, sensor: Configured, where: str, folder: Path) -> SensorFile | None:
@@ -294,8 +294,8 @@ def _port(common: _Common, sensor: Configured, where: str) -> SensorPort | None:
         if common.baud is not None:
             raise UsageError(f"{where}: option baud: at the bridge it is set in the sketch, as GNSS_BAUD")
     baud = common.baud or (115_200 if format_ == "csv" else 9600)
-    told_s = common.delay_s
-    delay_s = told_s if told_s is not None else 0.0 if format_ == "csv" else _FIX_DELAY_S
+    stated_s = common.delay_s
+    delay_s = stated_s if stated_s is not None else 0.0 if format_ == "csv" else _FIX_DELAY_S
     gnss = _gnss(common, where)
     return SensorPort(common.port, baud, format_, delay_s, gnss, sensor.columns, common.ticks)
 

@@ -274,10 +274,10 @@ def _links(problem: BundleProblem, noise: ImuNoise) -> Links:
         guess=np.tile(np.eye(4), (n, 1, 1)),
         guess_weight=np.zeros((n, 2)),
         velocity_weight=none,
-        told=np.zeros(n, dtype=np.bool_),
-        told_H=np.zeros((n, 12, 12)),
-        told_b=np.zeros((n, 12)),
-        told_at=np.zeros((n, 2, STATE)),
+        extra=np.zeros(n, dtype=np.bool_),
+        extra_H=np.zeros((n, 12, 12)),
+        extra_b=np.zeros((n, 12)),
+        extra_at=np.zeros((n, 2, STATE)),
         rest_weight=np.zeros(n + 1),
     )
 

@@ -46,10 +46,10 @@ class LinkStore:
             guess=np.tile(np.eye(4), (size, 1, 1)),
             guess_weight=np.zeros((size, 2)),
             velocity_weight=np.zeros(size),
-            told=np.zeros(size, dtype=np.bool_),
-            told_H=np.zeros((size, _POSES, _POSES)),
-            told_b=np.zeros((size, _POSES)),
-            told_at=np.zeros((size, 2, STATE)),
+            extra=np.zeros(size, dtype=np.bool_),
+            extra_H=np.zeros((size, _POSES, _POSES)),
+            extra_b=np.zeros((size, _POSES)),
+            extra_at=np.zeros((size, 2, STATE)),
             rest_weight=np.zeros(size),
         )
 
@@ -79,7 +79,7 @@ class LinkStore:
         inertial = self.usable(packet.imu)
         self._spans.append(packet.imu if inertial else None)
         self._motions.append(motions)
-        links.inertial[k], links.dt[k], links.told[k] = inertial, dt_s, False
+        links.inertial[k], links.dt[k], links.extra[k] = inertial, dt_s, False
         links.guess_weight[k], links.velocity_weight[k], links.rest_weight[k + 1] = 0.0, 0.0, 0.0
         if self._noise is not None:
             walk = np.repeat([self._noise.gyroscope_random_walk, self._noise.accelerometer_random_walk], 3)
@@ -142,7 +142,7 @@ class LinkStore:
         """
         links = self._links
         for k, motions in enumerate(self._motions):
-            if not motions or (links.told[k] and (held[k] or held[k + 1] or _is_near(X[k : k + 2], links.told_at[k]))):
+            if not motions or (links.extra[k] and (held[k : k + 2].any() or _is_near(X[k : k + 2], links.extra_at[k]))):
                 continue
             H, b = np.zeros((_POSES, _POSES)), np.zeros(_POSES)
             R_a, R_b = X[k, :9].reshape(3, 3), X[k + 1, :9].reshape(3, 3)
@@ -153,8 +153,8 @@ class LinkStore:
                 own = np.linalg.solve(np.eye(J_own.shape[1]) + J_own.T @ J_own, J_own.T)
                 H += J.T @ (J - J_own @ (own @ J))
                 b += J.T @ (r - J_own @ (own @ r))
-            links.told[k], links.told_H[k], links.told_b[k] = True, 0.5 * (H + H.T), b
-            links.told_at[k, 0], links.told_at[k, 1] = X[k], X[k + 1]
+            links.extra[k], links.extra_H[k], links.extra_b[k] = True, 0.5 * (H + H.T), b
+            links.extra_at[k, 0], links.extra_at[k, 1] = X[k], X[k + 1]
 
     def pop_front(self) -> None:
         """Forget the oldest link, and whether the oldest keyframe was at rest."""
@@ -193,10 +193,10 @@ class LinkStore:
         return out
 
 
-def _is_near(X: Array, told_at: Array) -> bool:
+def _is_near(X: Array, extra_at: Array) -> bool:
     """Return whether two states [2, 21] are turned, and apart, as they were; wherever they are."""
-    changed = np.abs(X - told_at)
-    apart = np.abs(np.diff(X[:, 9:12] - told_at[:, 9:12], axis=0))
+    changed = np.abs(X - extra_at)
+    apart = np.abs(np.diff(X[:, 9:12] - extra_at[:, 9:12], axis=0))
     return bool(changed[:, :9].max() < _HEAR_AGAIN_RAD and apart.max() < _HEAR_AGAIN_M)
 
 

@@ -96,8 +96,8 @@ def _setting(setting: Setting, width: int) -> list[str]:
     default = setting.value
     if isinstance(default, tuple):
         default = " ".join(map(str, default))
-    told = "" if default is None or isinstance(default, bool) else f" [{default}]"
-    return _lines(_left(setting), said_of(setting).split(";")[0] + told, width)
+    shown = "" if default is None or isinstance(default, bool) else f" [{default}]"
+    return _lines(_left(setting), said_of(setting).split(";")[0] + shown, width)
 
 
 def _left(setting: Setting) -> str:

@@ -79,10 +79,10 @@ def _examine_recording(options: DoctorOptions) -> int:
     if options.masks is not None:
         inspection = replace(inspection, findings=(*inspection.findings, *_masks(options.source, options.masks)))
     if options.json:
-        told = asdict(inspection)
+        fields = asdict(inspection)
         if not inspection.topics:
-            del told["topics"]  # only bags have any
-        print(json.dumps(told))
+            del fields["topics"]  # only bags have any
+        print(json.dumps(fields))
     else:
         _print_inspection(inspection)
     return DataError.exit_code if inspection.worst == "error" else 0

@@ -116,16 +116,16 @@ def _in_lock_step(
     base = map_choice(options.map, options.localize_only, config)
     driver, cart = Driver(goals, limits, not options.known_ground), LockStepCart(place, config.machine.gravity_m_s2)
     prepare(options.out, options.overwrite, base)
-    told = _Told(options.json)
+    printed = _Printed(options.json)
     with written_up(options.out, command), rewritten_line() as show:
 
         def follow(frames: int, _: int, tracking: str) -> None:
-            told.tell(driver.arrivals)
+            printed.show(driver.arrivals)
             number = min(len(driver.arrivals) + 1, len(goals))
             show(f"goal {number} of {len(goals)}, {frames} frames, {driver.hindrance or tracking}")
 
         drive(cart, driver, config, options.out, options.source, command, base, follow)
-    told.tell(driver.arrivals)
+    printed.show(driver.arrivals)
     return driver.arrivals
 
 
@@ -152,19 +152,19 @@ def _in_real_time(
     armed = steering.Armed(tuple(goals), limits, not options.known_ground, source.command_name, options.listen)
     live.add_driver(partial(steering.run, armed=armed, live=config.live))
     prepare(options.out, options.overwrite, base)
-    told = _Told(options.json)
+    printed = _Printed(options.json)
     with written_up(options.out, command, lambda: live.is_brief), rewritten_line() as show:
 
         def follow(run: LiveRun) -> None:
             notes = run.notes.get("drive", {})
-            told.tell(notes.get("arrivals", []))
+            printed.show(notes.get("arrivals", []))
             if notes.get("is_over") and not options.listen:
                 run.stop()
             show(f"{status_line(run)} {notes.get('hindrance', '')}")
 
         live.execute(follow)
     arrivals: list[Arrival] = live.notes.get("drive", {}).get("arrivals", [])
-    told.tell(arrivals)
+    printed.show(arrivals)
     return arrivals
 
 
@@ -174,13 +174,13 @@ def _refuse_blind(place: PlaceOptions, config: Config) -> None:
         raise UsageError(f"rig={place.rig} does not see what is in the way; leave it off, or give rig=rgbd")
 
 
-class _Told:
+class _Printed:
     """What was printed of goals."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json, self._count = as_json, 0
 
-    def tell(self, arrivals: list[Arrival]) -> None:
+    def show(self, arrivals: list[Arrival]) -> None:
         """Print a line for each goal that is new."""
         for arrival in arrivals[self._count :]:
             self._count += 1

@@ -19,7 +19,7 @@ from vislam.live.web.station import Station
 
 _LOG = logging.getLogger(__name__)
 _READ_S = 0.1
-_TOLD_S = 0.5  # between two looks at the progress
+_SHOW_EVERY_S = 0.5  # between two looks at the progress
 _FEWEST_SQUARES, _MOST_SQUARES = 3, 64
 FOLDER = "calibration"  # in the run folder
 STEPS = {name: kind.summary for name, kind in KINDS.items() if kind.watched_by is not None}
@@ -51,7 +51,7 @@ class CalibrationSteps:
         self._kind = ""
         self._watch: Watch | None = None
         self._opened: CartSensors | PlayedSensors | None = None
-        self._told_s = 0.0
+        self._shown_s = 0.0
         self.shown: dict[str, Any] = {}  # of the step, for the page
 
     @property
@@ -80,8 +80,8 @@ class CalibrationSteps:
         try:
             for value in self._opened.read(_READ_S):
                 self._watch.take(value)
-            if time.monotonic() - self._told_s >= _TOLD_S or self._opened.is_over:
-                self._told_s = time.monotonic()
+            if time.monotonic() - self._shown_s >= _SHOW_EVERY_S or self._opened.is_over:
+                self._shown_s = time.monotonic()
                 self._show(self._watch.progress())
         except VislamError as error:
             self._fail(error)
@@ -133,12 +133,12 @@ class CalibrationSteps:
         _LOG.info("calibrated: %s; %s", self._kind, ", ".join(files))
 
     def _show(self, progress: Progress) -> None:
-        told = plain(asdict(progress))
+        fields = plain(asdict(progress))
         jpeg = progress.jpeg
-        del told["jpeg"]
+        del fields["jpeg"]
         is_over = self._opened is not None and self._opened.is_over
         advice = "the recording has ended: finish" if is_over else progress.advice
-        self.shown = {"kind": self._kind, "stage": "going", **told, "advice": advice, "has_picture": bool(jpeg)}
+        self.shown = {"kind": self._kind, "stage": "going", **fields, "advice": advice, "has_picture": bool(jpeg)}
         if jpeg:
             self._station.show(jpeg)
 

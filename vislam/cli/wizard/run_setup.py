@@ -42,18 +42,18 @@ class RunSetup:
         if kind == "camera":
             return self._with_camera(camera if plus else inertial, path)
         inertial = inertial.partition(",")[0]  # of a camera with the IMU inside it
-        told = calibration_of(inertial, self.sensors)
+        stated = calibration_of(inertial, self.sensors)
         if kind == "imu":
             found = read_imu_calibration(path)
-            told = replace(
-                told,
+            stated = replace(
+                stated,
                 gyro_bias_rad_s=_vector(found.gyro_bias_rad_s), gyro_matrix=_matrix(found.gyro_matrix),
                 accel_bias_m_s2=_vector(found.accel_bias_m_s2), accel_matrix=_matrix(found.accel_matrix),
             )  # fmt: skip
         else:
             iron = read_mag_calibration(path)
-            told = replace(told, mag_bias_ut=_vector(iron.bias_ut), mag_matrix=_matrix(iron.matrix))
-        sensors = with_calibration(inertial, self.sensors, told)
+            stated = replace(stated, mag_bias_ut=_vector(iron.bias_ut), mag_matrix=_matrix(iron.matrix))
+        sensors = with_calibration(inertial, self.sensors, stated)
         return replace(self, sensors=sensors), "the run begins with it, in place of that in the sensors file"
 
     def _with_file(self, kind: str, path: Path) -> tuple[RunSetup, str]:
@@ -74,12 +74,12 @@ class RunSetup:
         if gives_frames(camera):
             return self, f"the run begins with its maker's calibration: {camera} has several cameras"
         before = self.config.calibration.camera
-        told = None if before is None else read_cameras(Path(before))[0]
-        if told is None or told.T_body_cam is None:
+        stated = None if before is None else read_cameras(Path(before))[0]
+        if stated is None or stated.T_body_cam is None:
             return self, "the run needs where the camera sits, too: vislam calibrate camera-imu adds that to the file"
         lens = read_cameras(path)[0].camera
         whole = path.with_name(_COMPLETE)
-        text = camchain_text([replace(told, camera=lens)], f"lens by {path.name}, place and clock by {before}")
+        text = camchain_text([replace(stated, camera=lens)], f"lens by {path.name}, place and clock by {before}")
         write_text(whole, text)
         return self._with_file("camera", whole)
 

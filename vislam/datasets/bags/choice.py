@@ -105,13 +105,13 @@ def chosen(listing: Listing, options: BagOptions, frames: Frames) -> Choice:
     guessed = _guessed_cameras(colors, depths, listing)
     cam0 = _image(listing, images, "cam0", options.cam0, guessed[0] if guessed else None)
     of_guess = guessed[1] if len(guessed) > 1 and cam0 is guessed[0] else _other_of(cam0, colors)
-    told_depth = _image(listing, images, "depth", options.depth, None)
-    cam1 = _image(listing, images, "cam1", options.cam1, None if told_depth else of_guess)
+    chosen_depth = _image(listing, images, "depth", options.depth, None)
+    cam1 = _image(listing, images, "cam1", options.cam1, None if chosen_depth else of_guess)
     cameras = tuple(camera for camera in (cam0, cam1) if camera is not None and cam0 is not None)
     if options.further:
         more = (_image(listing, images, "further", topic, None) for topic in options.further.split("+"))
         cameras = _one_each((*cameras, *(camera for camera in more if camera is not None)))
-    depth = told_depth
+    depth = chosen_depth
     if depth is None and options.depth is None and cam0 is not None and len(cameras) == 1:
         fitting = [facts for facts in depths if _registered(facts, cam0)]
         fitting += [facts for facts in depths if _info_of_depth(listing, facts, cam0, frames) is not None]

@@ -134,7 +134,7 @@ class LooseCore:
         own = self.sensing.suite.size
         self._config = config
         self._gravity = float(machine.gravity_m_s2)
-        self._told_sigmas = imu_sigmas(noise)
+        self._stated_sigmas = imu_sigmas(noise)
         self._lever = np.zeros(3) if T_body_camera is None else T_body_camera[:3, 3].copy()
         self._white_rate_sigma = float(noise.gyroscope_noise_density * np.sqrt(noise.rate_hz))
         self._limits = np.array([0.0] + [chi_square_limit(config.gate_probability, dof) for dof in range(1, 13)])
@@ -155,7 +155,7 @@ class LooseCore:
         """Return a state of nothing, before there is one."""
         n = len(self._all)
         x = np.concatenate((np.zeros(kernels.NOMINAL), self.sensing.suite.starts))
-        return LooseState(x, np.zeros((n, n)), Ledger(), self._told_sigmas)
+        return LooseState(x, np.zeros((n, n)), Ledger(), self._stated_sigmas)
 
     def begin(self, start: NavState, vo: VoMeasurement | None, noise: NoiseScale) -> LooseState:
         """Return the filter at a state; `vo` places the keyframe it refers to. Raises ValueError, see `Ekf`."""
@@ -171,7 +171,7 @@ class LooseCore:
         state.ledger = Ledger(
             last_vo_t_ns=start.t_ns, floor_z_m=float(state.x[2]), noise=noise, watch=Watch(start.t_ns, start.t_ns)
         )
-        state.sigmas = scaled(self._told_sigmas, noise)
+        state.sigmas = scaled(self._stated_sigmas, noise)
         if vo is not None:
             self._place_keyframe(state, vo)
         return state
@@ -215,7 +215,7 @@ class LooseCore:
         if isinstance(what, NoiseScale):
             out.accept("noise_changes")
             state.ledger = replace(state.ledger, noise=what)
-            state.sigmas = scaled(self._told_sigmas, what)
+            state.sigmas = scaled(self._stated_sigmas, what)
         elif isinstance(what, NewKeyframe):
             out.accept("keyframes")
             state.ledger = self._begin_keyframe(state, what.keyframe_id, event.t_ns)

@@ -270,7 +270,7 @@ class TightCore:
         self.counters = (*_COUNTERS, *self.sensing.counters)
         self._config = config
         self._gravity = gravity_m_s2
-        self._told_sigmas = imu_sigmas(noise)
+        self._stated_sigmas = imu_sigmas(noise)
         self._frames, self._known = FrameUpdater(config, gravity_m_s2, rig), KnownUpdater(config, noise)
         self._scale_sigmas = rig.cameras[0].sigmas.focal, rig.metres_sigma
         self.R_configured = np.ascontiguousarray(rig.T_body_cams[0][:3, :3], dtype=np.float64)
@@ -310,7 +310,7 @@ class TightCore:
         )
 
     def _at(self, x: Array, window: Window) -> TightState:
-        return TightState(_since_now(x), window, scaled(self._told_sigmas, window.noise))
+        return TightState(_since_now(x), window, scaled(self._stated_sigmas, window.noise))
 
     def time_of(self, event: TightEvent, state: TightState) -> int:
         """Return when an event happened: the stamps of frames and of rest are by the camera's clock."""
@@ -347,7 +347,7 @@ class TightCore:
             window, outcome = self._known.rest(window, state.x, gyro_rad_s, event.t_ns)
         elif isinstance(what, NoiseScale):
             window, outcome = replace(window, noise=what), Outcome(True, counts={"noise_changes": 1})
-            state.sigmas = scaled(self._told_sigmas, what)
+            state.sigmas = scaled(self._stated_sigmas, what)
         elif isinstance(what, Reading):
             window, outcome = corrected_by_reading(self.sensing, window, state.x, what, gyro_rad_s, ago_s)
         elif isinstance(what, OwnStart):

@@ -24,7 +24,7 @@ _MATCH_RATIO = 0.8  # nearest to second nearest descriptor; 0.8 keeps true match
 MATCH_MAX_DISTANCE = 64  # bits of 256; unrelated ORB descriptors are 128 apart
 INLIER_PX = 3.0  # reprojection error of an inlier; ORB's coarse octaves are good to 2 px
 INVERSE_DEPTH_SIGMA_1_M = 0.01  # of the difference of two inverse depths
-_MIN_TOLD = 8  # matches with two points that are to be expected, before their distances are asked
+_MIN_KNOWN = 8  # expected matches with both depths known, from which on their distances are tested
 _MAX_TOLD = 64  # of them that are compared: bounds the time to 0.2 ms
 _SIGMAS = 3.0
 _BEYOND_DOUBT = 2.0
@@ -58,8 +58,8 @@ def compare(a: View, b: View, config: LoopConfig, px: float) -> Likeness:
     pairs = match(a.descriptors, b.descriptors, _MATCH_RATIO, MATCH_MAX_DISTANCE)
     chance = config.chance_matched_share * min(len(a.xy), len(b.xy))
     least = max(config.min_inliers, chance + _SIGMAS * math.sqrt(chance))
-    told_share = a.known.sum() * b.known.sum() / max(1, len(a.xy) * len(b.xy))
-    if len(pairs) * told_share < _MIN_TOLD:
+    known_share = a.known.sum() * b.known.sum() / max(1, len(a.xy) * len(b.xy))
+    if len(pairs) * known_share < _MIN_KNOWN:
         return Likeness(pairs, 0, len(pairs) >= least)
     told = pairs[a.known[pairs[:, 0]] & b.known[pairs[:, 1]]][:_MAX_TOLD]
     points_a, points_b = a.points_or_nan()[told[:, 0]], b.points_or_nan()[told[:, 1]]

@@ -332,11 +332,11 @@ def _moved(e: Evidence, c: VerdictConfig) -> Iterator[str]:
                 yield f"{_own_words(one.name, variable, stated, moved)}; corrected"
 
 
-def _beyond(moved: Moved, told_sigma: float, degrees: int, config: VerdictConfig) -> bool:
+def _beyond(moved: Moved, stated_sigma: float, degrees: int, config: VerdictConfig) -> bool:
     """Whether a number is farther off than its sigma and that of what was given explain."""
     if not math.isfinite(moved.by) or not math.isfinite(moved.sigma):
         return False
-    variance = max(moved.sigma**2 + told_sigma**2, 1e-24)
+    variance = max(moved.sigma**2 + stated_sigma**2, 1e-24)
     return moved.by**2 / variance > chi_square_limit(config.probability, degrees)
 
 

@@ -89,7 +89,7 @@ def guess_error(a: Array, b: Array, guess: Array, J: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _told_shift(a: Array, b: Array, at: Array) -> Array:
+def _extra_shift(a: Array, b: Array, at: Array) -> Array:
     """Return how far both poses are from where further sensors were linearised [12]."""
     out = np.empty(12)
     da, db = difference(a, at[0]), difference(b, at[1])
@@ -99,29 +99,29 @@ def _told_shift(a: Array, b: Array, at: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _told_cost(X: Array, links: Links) -> float:
+def _extra_cost(X: Array, links: Links) -> float:
     """Return the cost of all motions by further sensors, up to a constant."""
     total = 0.0
-    for k in np.flatnonzero(links.told):
-        d = _told_shift(X[k], X[k + 1], links.told_at[k])
+    for k in np.flatnonzero(links.extra):
+        d = _extra_shift(X[k], X[k + 1], links.extra_at[k])
         for i in range(12):
-            total += links.told_b[k, i] * d[i]
+            total += links.extra_b[k, i] * d[i]
             for j in range(12):
-                total += 0.5 * d[i] * links.told_H[k, i, j] * d[j]
+                total += 0.5 * d[i] * links.extra_H[k, i, j] * d[j]
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_told(d: Array, links: Links, where: Ints, k: int, A: Array, g: Array) -> None:
+def _add_extra(d: Array, links: Links, where: Ints, k: int, A: Array, g: Array) -> None:
     """Add the motion of link k by further sensors, at a shift d [12], to the normal equations."""
     for i in range(12):
         at_i = where[k + i // 6, i % 6]
-        total = links.told_b[k, i]
+        total = links.extra_b[k, i]
         for j in range(12):
             at_j = where[k + j // 6, j % 6]
-            total += links.told_H[k, i, j] * d[j]
+            total += links.extra_H[k, i, j] * d[j]
             if at_j >= at_i:
-                A[at_i, at_j] += links.told_H[k, i, j]
+                A[at_i, at_j] += links.extra_H[k, i, j]
         g[at_i] += total
 
 
@@ -179,7 +179,7 @@ def cost(X: Array, calibration: Array, links: Links, gravity_m_s2: float) -> flo
                 total += (links.guess_weight[k, i // 3] * r[i]) ** 2
         for i in range(12, 15):
             total += (links.velocity_weight[k] * (X[k + 1, i] - X[k, i])) ** 2
-    return 0.5 * total + _told_cost(X, links)
+    return 0.5 * total + _extra_cost(X, links)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -225,8 +225,8 @@ def linearise(
                 weights[i, i] = links.guess_weight[k, i // 3] ** 2
             at[:6], at[6:12] = where[k, :6], where[k + 1, :6]
             _scatter(J6, weights, r, at[:12], A, g)
-        if links.told[k]:
-            _add_told(_told_shift(X[k], X[k + 1], links.told_at[k]), links, where, k, A, g)
+        if links.extra[k]:
+            _add_extra(_extra_shift(X[k], X[k + 1], links.extra_at[k]), links, where, k, A, g)
     if full:
         for k in range(rests):
             weight = links.rest_weight[k] ** 2

@@ -70,10 +70,10 @@ class Links(NamedTuple):
     guess: Array  # [., 4, 4] motion of the body
     guess_weight: Array  # [., 2] 1 / sigma of rotation and of translation; 0: no such factor
     velocity_weight: Array  # [.] 1 / sigma that velocity stays
-    told: NDArray[np.bool_]  # [.] whether further sensors measured the motion: `b @ d + d @ H @ d / 2` of both poses
-    told_H: Array  # [., 12, 12]
-    told_b: Array  # [., 12]
-    told_at: Array  # [., 2, 21] the states around which d [12] counts
+    extra: NDArray[np.bool_]  # [.] whether further sensors measured the motion: `b @ d + d @ H @ d / 2` of both poses
+    extra_H: Array  # [., 12, 12]
+    extra_b: Array  # [., 12]
+    extra_at: Array  # [., 2, 21] the states around which d [12] counts
     rest_weight: Array  # [M] 1 / sigma that velocity is zero
 
 

@@ -67,16 +67,16 @@ def marginalise(
     schur.eliminate(landmarks, 0.0, poses_at, A, g)
     gone, kept = where[0], np.concatenate([np.arange(D - CALIBRATION, D), where[1:].ravel()])
     A[:, D - CALIBRATION + np.flatnonzero(~camera.active)] = 0.0
-    told = np.flatnonzero(np.diag(A)[kept])  # of the others nothing is said: their rows and columns are zero
-    rows = np.concatenate([gone, kept[told]])
+    held = np.flatnonzero(np.diag(A)[kept])  # the others are not constrained: their rows and columns are zero
+    rows = np.concatenate([gone, kept[held]])
     A = A[np.ix_(rows, rows)]
     A += A.T - np.diag(np.diag(A))  # below the diagonal was nothing
     n = len(gone)
     gain = A[n:, :n] @ _inverse(A[:n, :n])
     left = A[n:, n:] - gain @ A[:n, n:]
     H, gradient = np.zeros((len(kept),) * 2), np.zeros(len(kept))
-    H[np.ix_(told, told)] = 0.5 * (left + left.T)
-    gradient[told] = g[kept[told]] - gain @ g[gone]
+    H[np.ix_(held, held)] = 0.5 * (left + left.T)
+    gradient[held] = g[kept[held]] - gain @ g[gone]
     moved = [difference(x, first)[:size] for x, first in zip(X[1:], X_linear[1:], strict=True)]
     shift = np.concatenate([dx[:CALIBRATION], *moved])
     return Prior(H, gradient - H @ shift, prior.calibration)
