@@ -11,7 +11,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-BUDGET_PACKAGE = 10  # words of the list in vislam/; a commit that raises it says why
+BUDGET_PACKAGE = 9  # words of the list in vislam/; a commit that raises it says why
 INSTEAD = {
     r"tells?|told|untold": "report, state, give, assume, distinguish",
     r"news": "change, update",

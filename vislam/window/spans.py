@@ -134,9 +134,9 @@ class LinkStore:
             self.integrate(k, biases[k])
 
     def hear(self, X: Array, held: NDArray[np.bool_]) -> None:
-        """Linearise what further sensors said at X [n + 1, 21], unless it is linearised near to it.
+        """Linearise motions by further sensors at X [n + 1, 21], unless they are linearised near to it.
 
-        Where the prior holds a state it stays as it was. Neither place shows in it, so that both may move together.
+        Where the prior holds a state they stay as they were. They are relative, so that both states may move together.
 
         Own variables are not the window's: they are eliminated link by link, with the sigmas that they came with.
         """
