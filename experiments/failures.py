@@ -36,7 +36,7 @@ _ROOT = os.geteuid() == 0
 _MOUNTS = _ROOT  # a container's root may not
 _DROPPED_CAPABILITIES = (1, 2)  # linux/capability.h: DAC_OVERRIDE, DAC_READ_SEARCH
 _PR_CAPBSET_DROP = 24  # linux/prctl.h
-_WORLD = "points:corridor-loop,duration_s=8,camera_hz=10,tracks=100"
+_WORLD = "points:corridor-loop,duration_s=5,camera_hz=10,tracks=100"
 SIMULATE = "simulate handheld-room --duration-s 1 --image-width-px 160 --out"  # the world that is painted soonest
 _MEND_KB = 400_000
 # CPython 3.11 keeps a byte code file of which it could write a part only, and never starts again

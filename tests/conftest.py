@@ -116,10 +116,11 @@ def painted_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
         def make(folder: Path) -> None:
             scene = paint(build, seed)
-            np.savez(folder / "scene.npz", **{field.name: getattr(scene, field.name) for field in fields(Scene)})
+            for field in fields(Scene):
+                np.save(folder / f"{field.name}.npy", getattr(scene, field.name))
 
         folder = shared(tmp_path_factory, f"painted-{build.__module__}-{build.__qualname__}-{seed}", make)
-        return Scene(**np.load(folder / "scene.npz"))
+        return Scene(**{field.name: np.load(folder / f"{field.name}.npy") for field in fields(Scene)})
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "painted", painted)

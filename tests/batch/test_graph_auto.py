@@ -22,7 +22,7 @@ from vislam.core.geometry import align_points
 AUTO = PoseGraphConfig(robust="auto")
 
 
-def _city(fraction, group, poses=600):
+def _city(fraction, group, poses=400):
     return simulate_graph(
         "manhattan", GraphWorldConfig(poses=poses, outlier_fraction=fraction, alias_group=group, seed=3)
     )

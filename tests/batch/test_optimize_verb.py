@@ -183,7 +183,7 @@ class _Start:
 
 
 @pytest.mark.parametrize(
-    ("source", "seconds", "bound_m"), [("euroc:euroc_mh01_17s", 12.0, 0.010), ("tum:tum_fr1_desk", 4.0, 0.020)]
+    ("source", "seconds", "bound_m"), [("euroc:euroc_mh01_17s", 9.0, 0.010), ("tum:tum_fr1_desk", 4.0, 0.020)]
 )
 def test_real_recordings_are_not_worse_than_their_graph(source, seconds, bound_m, data_root, tmp_path):
     kind, _, name = source.partition(":")

@@ -94,9 +94,9 @@ def check(ended: Ended, number: signal.Signals, moment: str) -> None:
 
 def test_a_verb_ends_at_random_moments_and_leaves_nothing_in_the_way(tmp_path: Path) -> None:
     """Moments are shares of the CPU that it takes from its start to its last file, whatever the machine."""
-    rng, out, interrupts = random.Random(SEED), tmp_path / "corridor", 0
+    rng, out, interrupts = random.Random(SEED), tmp_path / "room", 0
     print("seed", SEED)
-    arguments = ["simulate", "corridor-loop", "--duration-s", "1", "--image-width-px", "160", "--out"]
+    arguments = ["simulate", "handheld-room", "--duration-s", "1", "--image-width-px", "160", "--out"]
     for whole in (tmp_path / "first", tmp_path / "second"):
         whole_s, process = 0.0, started([*arguments, str(whole)])
         while process.poll() is None:

@@ -122,7 +122,7 @@ def test_few_places_show_how_turns_differ_and_no_cause_and_two_show_nothing() ->
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Recordings of two simulated worlds."""
     made = {}
-    for world, seed, duration_s in (("handheld-room", 3, 14.0), ("corridor-loop", 1, 20.0)):
+    for world, seed, duration_s in (("handheld-room", 3, 11.0), ("corridor-loop", 1, 15.0)):
         made[world] = tmp_path_factory.mktemp(world)
         options = {"rig": "mono", "duration_s": duration_s, "camera_hz": 10.0, "image_width_px": 320}
         record(open_world(world, seed, workers=2, **options), made[world])
@@ -130,7 +130,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def spoilt(source: Path, root: Path, factor: float, turn: np.ndarray, late_s: float) -> Path:
-    """Copy cam0, up to 200 images of it, and imu0 with a wrong focal length, mount or clock."""
+    """Copy cam0, up to 150 images of it, and imu0 with a wrong focal length, mount or clock."""
     for name in ("cam0", "imu0"):
         (root / "mav0" / name).mkdir(parents=True)
         for file in ("data.csv", "sensor.yaml"):
@@ -144,7 +144,7 @@ def spoilt(source: Path, root: Path, factor: float, turn: np.ndarray, late_s: fl
     sensor["intrinsics"] = [factor * f for f in sensor["intrinsics"][:2]] + sensor["intrinsics"][2:]
     (cam0 / "sensor.yaml").write_text(yaml.safe_dump(sensor))
     head, *lines = (cam0 / "data.csv").read_text().splitlines()
-    stamped = [line.split(",") for line in lines[:200]]
+    stamped = [line.split(",") for line in lines[:150]]
     late_ns = round(1e9 * late_s)
     (cam0 / "data.csv").write_text("\n".join([head, *(f"{int(t) + late_ns},{name}" for t, name in stamped)]) + "\n")
     return root

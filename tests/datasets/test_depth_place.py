@@ -73,7 +73,7 @@ def check(fit: PlaceFit | None, most_turn_deg: float, most_m: float) -> None:
 
 
 def test_all_is_found_together_from_starts_that_are_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = survey(f"tum:{write_scene(tmp_path / 'drawn', 40)}")
+    found = survey(f"tum:{write_scene(tmp_path / 'drawn', 30)}")
     assert found.rig is not None
     start = replace(TRUTH, time_offset_s=0.0, own=DepthCamera(LENS.with_focal(1.03), np.eye(4)))
     fit = fit_place(with_depth_format(found, start), found.rig)

@@ -243,7 +243,7 @@ def hand_with_fast_turns(rng: np.random.Generator) -> BodySpline:
         angles += wander(t_s, swing, 1.0, (0.3, 1.0), 3) * np.array([0.1, 0.14, 0.28])
         return position, angles + wander(t_s, tremble, 0.006, (1.5, 4.0), 3)
 
-    return BodySpline.from_design(design, 8.0, 0.05)
+    return BodySpline.from_design(design, 6.5, 0.05)
 
 
 @pytest.mark.slow

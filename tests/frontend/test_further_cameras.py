@@ -99,7 +99,7 @@ def test_a_rig_goes_on_while_its_first_camera_is_dark() -> None:
     off_m = {}
     for further in (0, 2):
         recording = open_points(
-            "laps", 1, rig="mono", further_cameras=further, duration_s=13.0, outage_begin_s=9.0, outage_length_s=3.5
+            "laps", 1, rig="mono", further_cameras=further, duration_s=10.5, outage_begin_s=6.5, outage_length_s=3.5
         )
         slam = Slam(Config(), recording.rig, recording.imu_noise)
         steps = [step for value in recording.events() for step in slam.feed(value) if step.T_map_body is not None]

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from live_runs import PATIENCE_S, begin, has_map, interrupt, left_behind, until
 
 from vislam.core import Recording
 from vislam.live import replay, run_live
+from vislam.live.processes import child
 from vislam.live.replayed_imu import InertialTable
 from waiting import HUNG_S
 from worlds.shared import shared
@@ -20,6 +22,16 @@ def patient_end() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_live, "_BRIEF_S", HUNG_S)
         patch.setattr(run_live, "_AFTER_FAILURE_S", HUNG_S)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def imported_once() -> Iterator[None]:
+    """Fork the processes of a run from one that has imported what they do: 4 s of CPU a run. Who spawns says so."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload([f"vislam.live.processes.{role}" for role in ("fast", "front", "back", "map")])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(child, "get_context", lambda _: context)
         yield
 
 

@@ -94,7 +94,13 @@ def interrupt(run: LiveRun) -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
+def is_of_a_run(process: psutil.Process) -> bool:
+    """Whether a process was spawned, or forked from the one that has imported all; not that one itself."""
+    words = " ".join(process.cmdline())
+    return "spawn_main" in words or ("forkserver" in words and process.ppid() != os.getpid())
+
+
 def left_behind(name: str = "going-on") -> list[str]:
     """Return processes and shared memory of a run that should have ended."""
-    children = [p.name() for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
-    return children + [p.name for p in Path("/dev/shm").glob(f"*vislam-test-{name}-{os.getpid()}*")]
+    going = [process.name() for process in psutil.Process().children(recursive=True) if is_of_a_run(process)]
+    return going + [p.name for p in Path("/dev/shm").glob(f"*vislam-test-{name}-{os.getpid()}*")]

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
+from live_runs import left_behind
 
 from vislam.config import Config, RealsenseConfig, SensorsConfig, load
 from vislam.core.errors import HardwareError, UsageError
@@ -106,7 +106,7 @@ def test_one_process_owns_the_device_and_the_run_has_both(folder: Path, tmp_path
     assert np.ptp(x_right) > 0.3
     assert np.median(np.abs(off - np.median(off))) < 0.03  # of most: what a stall hides takes keyframes to come right
     assert not list(Path("/dev/shm").glob(f"vislam-device-{os.getpid()}-*"))
-    assert not [p for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    assert left_behind("device") == []
 
 
 def test_a_device_that_is_not_there_is_named_before_anything_starts(folder: Path, tmp_path: Path) -> None:

@@ -212,7 +212,7 @@ def test_what_a_driven_cart_cannot_be_is_said(tmp_path: Path, capsys: pytest.Cap
 def test_the_virtual_cart_reaches_goals_by_what_it_sees_alone(tmp_path: Path) -> None:
     """Real driver, emulated chips, rendered camera, reference pipeline; the truth decides."""
     config = load(None, {"view.enabled": False, "map.products": ("drive",)})
-    options = PlaceOptions(world="room", rig="rgbd", camera_hz=5.0, image_width_px=480, imu_out=((3.0, 3.8),))
+    options = PlaceOptions(world="room", rig="rgbd", camera_hz=5.0, image_width_px=320, imu_out=((3.0, 3.8),))
     cart = LockStepCart(options, config.machine.gravity_m_s2)
     goal = Goal(0.9, 0.1, math.pi / 2.0)
     driver = Driver([goal], Limits())

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from vislam.hw.chips import BusError
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.live import run_live
+from vislam.live.processes import child
 from vislam.live.replay import Outages, ReplaySource
 from vislam.live.run_live import LiveRun
 from vislam.runs.folder import prepare
@@ -49,7 +51,7 @@ class Lingering(ReplaySource):
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list[Health]]:
     """A run to its end in which the IMU and then the camera are unplugged, and the health that was seen on the way.
 
-    Its fast process does not leave by itself.
+    Its processes are spawned, as outside of tests, and the fast one does not leave by itself.
     """
     out = tmp_path_factory.mktemp("live") / "whole"
     prepare(out, overwrite=False)
@@ -58,6 +60,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list
     live.notes = Notes()
     lasted_16_s = until(lambda run: status(run).get("samples", 0) > 3000 and has_map(run), LiveRun.stop)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(child, "get_context", get_context)
         patch.setattr(run_live, "_TAKING_APART_S", 0.1)
         metrics = live.execute(lasted_16_s, PATIENCE_S)
     assert left_behind("whole") == []

@@ -30,7 +30,7 @@ class Drive:
     """The cart of `points:cart-drive`, without its camera."""
 
     def __init__(self, sensors: dict[str, dict[str, object]], start_s: float = 0.0, seed: int = 0) -> None:
-        recording = open_source(f"points:cart-drive,rig=none,start_s={start_s:g},duration_s=40", seed)
+        recording = open_source(f"points:cart-drive,rig=none,start_s={start_s:g},duration_s=30", seed)
         setup = sensor_setup({"sensors": sensors}, "here", Path()) if sensors else None
         self.slam = Slam(load(None, {}), recording.rig, recording.imu_noise, None if setup is None else setup.suite)
         values = recording.events()

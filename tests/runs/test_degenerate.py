@@ -60,7 +60,7 @@ def test_a_slow_start_is_not_held_back(tmp_path, coupling):
 
 
 def test_no_texture_for_three_seconds(tmp_path):
-    uri = f"points:laps,rig=stereo,duration_s=16,outage_begin_s=8,outage_length_s=3,{CAMERA}"
+    uri = f"points:laps,rig=stereo,duration_s=11,outage_begin_s=5,outage_length_s=3,{CAMERA}"
     metrics, errors, _ = run(tmp_path, uri)
     assert metrics["counters"]["front"]["frames_lost"] > 20
     assert errors["ekf"]["ate_rmse_m"] < 0.15
@@ -69,7 +69,7 @@ def test_no_texture_for_three_seconds(tmp_path):
 
 @pytest.mark.parametrize("coupling", ["loose", "tight"])
 def test_somebody_fills_half_of_the_image(tmp_path, coupling):
-    uri = f"points:laps,rig=stereo,duration_s=16,moving_share=0.5,moving_begin_s=7,{CAMERA}"
+    uri = f"points:laps,rig=stereo,duration_s=11,moving_share=0.5,moving_begin_s=5,{CAMERA}"
     _, errors, _ = run(tmp_path, uri, ekf__coupling=coupling, graph__coupling=coupling)
     assert errors["ekf"]["ate_rmse_m"] < 0.1
     assert errors["graph"]["ate_rmse_m"] < 0.15
@@ -77,7 +77,7 @@ def test_somebody_fills_half_of_the_image(tmp_path, coupling):
 
 def test_somebody_fills_half_of_the_image_of_one_camera(tmp_path):
     """Whenever tracking starts anew, nearly all tracks that are known by name are on the person."""
-    uri = f"points:laps,rig=mono,duration_s=20,moving_share=0.5,moving_begin_s=8,{CAMERA}"
+    uri = f"points:laps,rig=mono,duration_s=15,moving_share=0.5,moving_begin_s=8,{CAMERA}"
     _, errors, _ = run(tmp_path, uri)
     assert errors["ekf"]["ate_rmse_m"] < 0.3
     assert errors["graph"]["ate_rmse_m"] < 0.3
@@ -85,7 +85,7 @@ def test_somebody_fills_half_of_the_image_of_one_camera(tmp_path):
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_a_noise_model_ten_times_off(tmp_path, factor):
-    uri = f"points:laps,rig=stereo,duration_s=14,imu_noise_factor={factor},{CAMERA}"
+    uri = f"points:laps,rig=stereo,duration_s=10,imu_noise_factor={factor},{CAMERA}"
     metrics, errors, _ = run(tmp_path, uri)
     for sensor in metrics["imu_noise"].values():
         assert sensor["used_last"] == pytest.approx(max(sensor["told"], sensor["typical"]), rel=0.5)
@@ -122,7 +122,7 @@ def test_uniform_motion_of_one_camera_is_stated_and_its_sigmas_grow(tmp_path):
 
 
 def test_laps_of_one_camera_are_no_uniform_motion(tmp_path):
-    metrics, errors, _ = run(tmp_path, f"points:laps,rig=mono,duration_s=16,{CAMERA}", graph__coupling="loose")
+    metrics, errors, _ = run(tmp_path, f"points:laps,rig=mono,duration_s=12,{CAMERA}", graph__coupling="loose")
     assert not any("uniform motion for" in reason for reason in metrics["verdict"]["reasons"])
     assert metrics["counters"]["front"]["frames_without_excitation"] < 75
     assert errors["ekf"]["ate_max_m"] < 0.2

@@ -172,14 +172,14 @@ def test_a_recording_without_an_accelerometer_has_no_forces(tmp_path):
 
 
 def begun(recording: Path, folder: Path) -> Path:
-    """Return a folder with the first quarter of a recording in TUM's layout."""
+    """Return a folder with the first sixth of a recording in TUM's layout."""
     (folder / recording.name).mkdir(parents=True)
     for entry in recording.iterdir():
         (folder / recording.name / entry.name).symlink_to(entry)
     images = folder / recording.name / "rgb.txt"
     lines = images.read_text(encoding="utf-8").splitlines()
     images.unlink()
-    images.write_text("\n".join(lines[: len(lines) // 4]) + "\n", encoding="utf-8")
+    images.write_text("\n".join(lines[: len(lines) // 6]) + "\n", encoding="utf-8")
     return folder / recording.name
 
 

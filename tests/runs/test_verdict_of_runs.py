@@ -20,7 +20,7 @@ from vislam.runs.report import write_report
 from vislam.runs.sources import open_source
 from vislam.runs.verdict import judge
 
-_URI = "points:laps,rig=stereo,duration_s=12,camera_hz=10,tracks=80"
+_URI = "points:laps,rig=stereo,duration_s=10,camera_hz=10,tracks=80"
 
 
 def run(out, fault="", uri=_URI, **when):

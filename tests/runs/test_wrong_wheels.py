@@ -25,7 +25,7 @@ def verdict_on(tmp_path, fault, seed=0):
             f'[sensors.wheels]\nkind = "wheels"\nsimulated_hz = 20.0\ntrack_width_m = {width_m}\n'
         )
         setups.append(load_sensor_setup(tmp_path / name))
-    recording = open_source("points:cart-drive,rig=none,duration_s=45", seed)
+    recording = open_source("points:cart-drive,rig=none,duration_s=40", seed)
     values = list(FurtherReadings(recording, setups[1], seed).among(recording.events()))
     for k, value in enumerate(values):
         if isinstance(value, Reading):

@@ -40,11 +40,11 @@ estimators = [{name = "tight", outputs = ["live", "graph"]}]
 # {cart}: 3 s of a cart over a floor, {graph}: a pose graph of 60 poses, {plan}: a plan of one start.
 # What takes minutes whatever its input has --help: it is imported, and understands its options.
 SMALLEST = {
-    "experiments/aliasing.py": "--worlds panels-2.0 --losses 1 --length-m 9",
+    "experiments/aliasing.py": "--worlds panels-2.0 --losses 1 --length-m 7",
     "experiments/breaks.py": "--help",
     "experiments/cart_ride.py": "--help",
     "experiments/cart_wheels.py": "--seeds 0 --duration-s 12 --blind-at-s 4 --radii 'as told'",
-    "experiments/cloud_smoothing.py": "--seconds 0.5",
+    "experiments/cloud_smoothing.py": "--seconds 0.1",
     "experiments/depth_alone.py": "--source {recording} --dark 0.5 --begin 1 --length 2.5",
     "experiments/depth_in_map.py": "--source {recording} --split 1.5 --until 3 --dark-after 0.4",
     "experiments/drive_goals.py": "--help",
@@ -52,7 +52,7 @@ SMALLEST = {
     "experiments/free_voxels.py": "--run {run}",
     "experiments/gtsam_drives.py": "--out out",
     "experiments/label_noise.py": "--hz 0.2 --width 64",
-    "experiments/loop_precision_recall.py": "--sources points:laps,duration_s=4,tracks=60 --seeds 1 --out out",
+    "experiments/loop_precision_recall.py": "--sources points:laps,duration_s=2,tracks=60 --seeds 1 --out out",
     "experiments/rigs.py": "--rigs stereo+1 --seeds 0 --seconds 2",
     "experiments/masks.py": "--shares 0.3 --seconds 3 --width 160",
     "experiments/moving_person.py": "--seconds 3 --width 64",
@@ -80,9 +80,9 @@ SMALLEST = {
     "benchmarks/monodepth.py": "--frames 0 --accuracy-frames 3",
     "benchmarks/pose_graph.py": "growth --shapes manhattan --sizes 100",
     "benchmarks/range_frames.py": "2",
-    "benchmarks/sensor_cost.py": "--seconds 2 --rounds 1",
+    "benchmarks/sensor_cost.py": "--seconds 1 --rounds 1",
     "benchmarks/startup.py": "--help",
-    "benchmarks/window.py": "compare --seconds 4 --seeds 1",
+    "benchmarks/window.py": "compare --seconds 2 --seeds 1",
 }
 ELSEWHERE = {  # what runs the others, or what they need that is not here
     "experiments/bombs.py": "tests/test_fuzz.py",

@@ -21,7 +21,7 @@ from vislam.trajectory import read_tum
 from worlds.mini_recording import imu_rows, write_camera, write_imu
 from worlds.sensed_drive import FIXES, SOURCE, WHEELS, Driven, drive, driven, settings
 
-BLIND = "points:cart-drive,rig=stereo,duration_s=26,camera_hz=10,tracks=100,outage_begin_s=12,outage_length_s=12"
+BLIND = "points:cart-drive,rig=stereo,duration_s=20,camera_hz=10,tracks=100,outage_begin_s=8,outage_length_s=10"
 QUIET = ["--map.no-enabled", "--view.no-enabled"]
 ANCHORS = {1: (-7.0, -5.0, 0.1), 2: (7.0, -5.0, 2.5), 3: (7.0, 5.0, 0.3), 4: (-7.0, 5.0, 2.8)}
 RANGES = (

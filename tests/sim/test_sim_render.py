@@ -215,7 +215,7 @@ def test_blur_softens_moving_images_and_not_resting_ones(painted):
 )
 def test_blur_is_that_of_sharp_images_averaged_over_the_exposure(painted, name, options):
     world = painted(name, image_width_px=320, image_noise=False, exposure_changes=False, **options)
-    renderer, T_body_cam, moments = Renderer(world.rig.cameras[0]), world.rig.T_body_cams[0], 24
+    renderer, T_body_cam, moments = Renderer(world.rig.cameras[0]), world.rig.T_body_cams[0], 16
     errors, sharp_errors, seconds = [], [], frame_seconds(world)
     for index in np.linspace(20, world.frame_count - 20, 8)[::2].astype(int):
         t_s = seconds[index]

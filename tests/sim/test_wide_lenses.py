@@ -9,7 +9,7 @@ from vislam.core import Camera, Rig
 
 def ate_m(painted, model: str, coefficients: tuple[float, ...]) -> float:
     """Return the error of a stereo run through a room, by cameras of a model that see 120 degrees across."""
-    world = painted("handheld-room", seed=3, rig="stereo", image_width_px=320, duration_s=7.0, camera_hz=10.0)
+    world = painted("handheld-room", seed=3, rig="stereo", image_width_px=320, duration_s=6.0, camera_hz=10.0)
     sigmas = world.rig.cameras[0].sigmas
     camera = Camera(320, 240, 145.0, 145.0, 159.0, 121.0, 0.0, model, coefficients, sigmas)
     world.rig = Rig((camera, camera), world.rig.T_body_cams)

@@ -1,6 +1,7 @@
 """Runs of a simulated world as factor logs: exact motion, landmarks seen with noise, outliers, true and false loops."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -52,6 +53,7 @@ def rig_for(kind: Kind) -> Rig:
     return rig_of(kind, CAMERA, T_BODY_CAM0, transform(np.eye(3), np.array([BASELINE_M, 0.002, -0.001])))
 
 
+@lru_cache(maxsize=8)
 def simulate(
     kind: Kind,
     *,
