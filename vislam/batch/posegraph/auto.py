@@ -1,11 +1,11 @@
 """Which loops of a pose graph to believe, without a given method: several are tried, evidence decides.
 
-All edges, graduated non-convexity, and robust kernels of several shapes and scales lead to solutions in different
-places. Each is settled by `Judge`, which lets loops in and takes them back until all agree, and they are compared by
-their marginal likelihood. Loops within the noise stated, which only the smaller noise of the others speaks against, are
-kept as its tails. Where two solutions contradict each other and the places that speak for one are not clearly more than
-those that speak for the other, or where a cluster of loops is confirmed by nothing else and hardly likelier true than
-false, nothing is decided: such loops stay out, and are named.
+All edges, a robust kernel, graduated non-convexity, and odometry alone lead to solutions in different places. Each is
+settled by `Judge`, which lets loops in and takes them back until all agree, and they are compared by their marginal
+likelihood. Loops within the noise stated, which only the smaller noise of the others speaks against, are kept as its
+tails. Where two solutions contradict each other and are hardly less likely than each other, or where a cluster of loops
+is confirmed by nothing else and hardly likelier true than false, nothing is decided: such loops stay out, and are
+named.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from scipy.spatial import cKDTree
 
 from vislam.batch.posegraph.gnc import reject_false_edges, trusted_edges
 from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
-from vislam.batch.posegraph.plain import solve
 from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
 from vislam.batch.posegraph.solver import Kernel, Progress, kernel_route, levenberg_marquardt
 from vislam.batch.posegraph.starts import chordal_start, odometry_start
@@ -32,22 +31,18 @@ from vislam.core.messages import Array
 
 Mask = NDArray[np.bool_]
 
-# the loops' chi2 at odometry of which quantile is the first scale: from the few that odometry can judge, or from many
-_ROUTES: tuple[tuple[Kernel, float], ...] = (
-    ("geman-mcclure", 0.05), ("dcs", 0.2), ("dcs", 0.05), ("geman-mcclure", 0.2), ("geman-mcclure", 0.02),
-)  # fmt: skip
 _IN = 0.25  # weight under a kernel from which on a loop is among those that are judged first
+_QUANTILE = 0.2  # of the loops' chi2 at odometry: a kernel's first scale
 _KERNEL_QUANTILE = 0.05  # where one kernel alone is asked for
 _BEYOND_SHARE = 0.01  # of loops beyond what noise allows, up to which all may be true
 _TAILS = 16.0  # times the limit of a loop within the noise stated, with the noise that others show
 _MORE_OFTEN = 1.5  # loops of the place seen most often, over those of any that is lost
 _ITERATIONS, _TOLERANCE = 20, 1e-5
-_SETTLED_MAX = 2  # solutions in different places that are followed to their end
+_NEARLY_ALL = 0.97  # of the loops kept, from which on nothing else is tried
 _OVERSTATED = 0.1  # of the stated variances: where loops show less, all are rescaled before judging
 _NUMBERS_MIN = 30  # redundant ones, to show it
 _SAME_PLACE = 0.02  # of the extent: solutions that differ by less, rms, are one
-_CLEAR = 1.5  # witnesses of a solution over those of its rival
-_APART = 8.0  # log-likelihood between them, below which witnesses do not matter
+_APART = 8.0  # log-likelihood between solutions that contradict each other, below which nothing is decided
 _GAIN_MIN = 6.0  # of the objective: what a solution must explain beyond odometry alone, if all others contradict it
 _ALONE = 0.5  # leverage from which on nothing else confirms a loop
 _THIN = 4.0  # log-odds of a cluster that stands alone, below which it is not believed
@@ -73,25 +68,25 @@ def decide(
         problem = replace(problem, information=problem.information / scale)
         reason = f"; these on top of all variances times {scale:.3g}, which loops show"
     gnc = Decision(poses, weights, "graduated non-convexity")
-    decision = _decide(structure, problem, trusted, gnc, config, progress)
+    decision = _decide(structure, problem, trusted, gnc, config)
     return replace(decision, reason=decision.reason + reason)
 
 
 def _decide(
-    structure: Structure, problem: PoseGraphProblem, trusted: Mask, gnc: Decision, config: PoseGraphConfig,
-    progress: Progress | None,
-) -> Decision:  # fmt: skip
+    structure: Structure, problem: PoseGraphProblem, trusted: Mask, gnc: Decision, config: PoseGraphConfig
+) -> Decision:
     """Return what evidence decides about the loops of `problem`, the structure's with noise that fits."""
     chain = problem.with_edges(trusted)
     odometry = odometry_start(chain, chain.anchors())
     if trusted.all():
         return Decision(None, np.ones(len(trusted)), "there are no loops to doubt")
     judge = Judge(problem, trusted, odometry, config.inlier_probability)
-    plain = _plain(structure, config, trusted, progress)
-    found = _solutions(problem, judge, trusted, _routes(problem, trusted, odometry, plain, gnc, progress))
-    loops = np.flatnonzero(~trusted)
-    (best_name, best), rivals = found[0], found[1:]
+    assert gnc.poses is not None
+    plain = _plain(structure.problem, trusted, gnc.poses, config.inlier_probability)
     alone, _ = judge.objective(odometry, trusted)
+    found = _solutions(problem, judge, trusted, _routes(problem, trusted, odometry, plain, gnc), alone)
+    loops = np.flatnonzero(~trusted)
+    (best_name, best), rivals = found[0], [e for e in found[1:] if e[1].is_likelier(alone)]
     gain = alone - best.objective
     held, lost = best.kept & ~trusted, ~best.kept
     if not held.any() or not _is_enough(problem, judge, gain, held, lost):
@@ -102,7 +97,7 @@ def _decide(
         return Decision(odometry, trusted.astype(np.float64), "odometry alone", loops, warning)
     tails = lost & _tails(structure.problem, problem, best, plain, config)
     kept, poses = best.kept | tails, best.poses
-    disputed = _disputed(judge, best, rivals)
+    disputed = _disputed(best, [rival for _, rival in rivals if not _same(problem, rival.poses, best.poses)])
     thin = _thin(problem, best, trusted) & bool(np.any(lost & ~tails))
     undecided = np.flatnonzero(disputed | thin)
     kept[undecided] = False
@@ -119,11 +114,10 @@ def _decide(
     return Decision(poses, kept.astype(np.float64), reason, undecided, warning)
 
 
-def _plain(structure: Structure, config: PoseGraphConfig, trusted: Mask, progress: Progress | None) -> Array | None:
+def _plain(problem: PoseGraphProblem, trusted: Mask, poses: Array, probability: float) -> Array | None:
     """Return the optimum of all edges, if loops are off by no more than what is stated of their noise allows."""
-    problem = structure.problem
-    poses = solve(structure, config, progress).descent.poses
-    beyond = problem.edge_chi2(poses)[~trusted] > chi_square_limit(config.inlier_probability, problem.tangent)
+    poses = _lowest(problem, poses, np.ones_like(trusted))
+    beyond = problem.edge_chi2(poses)[~trusted] > chi_square_limit(probability, problem.tangent)
     return poses if beyond.mean() <= _BEYOND_SHARE else None
 
 
@@ -173,51 +167,45 @@ def decide_by_kernel(problem: PoseGraphProblem, kernel: Kernel, progress: Progre
 
 
 def _solutions(
-    problem: PoseGraphProblem, judge: Judge, trusted: Mask, routes: Iterable[tuple[str, Array, Mask]]
+    problem: PoseGraphProblem, judge: Judge, trusted: Mask, routes: Iterable[tuple[str, Array, Mask]], alone: float
 ) -> list[tuple[str, Judgement]]:
-    """Return settled solutions in different places, the likeliest first, with the names of what led to them."""
-    first: list[tuple[float, str, Array, Mask]] = []
-    for name, end, kept in routes:
-        objective, poses = judge.objective(_lowest(problem, end, kept), kept)
-        agrees = np.any(kept & ~trusted) and any(_same(problem, poses, other) for _, _, other, _ in first)
-        first.append((objective, name, poses, kept))
-        if agrees:
-            break
-    first.sort(key=lambda entry: entry[0])
+    """Return settled solutions, the likeliest first, with the names of what led to them.
+
+    One route after the other is followed, till two lead to the same place or one keeps nearly all loops. From odometry
+    alone, whose objective is `alone`, the few that enter first may be too few for the others, so that some of these are
+    supposed true, unless what is likelier leaves none in doubt.
+    """
     settled: list[tuple[str, Judgement]] = []
-    tried: list[Array] = []
-    for _, name, poses, kept in first:
-        if len(tried) == _SETTLED_MAX:
+    for name, end, kept in routes:
+        poses = _lowest(problem, end, kept)
+        believed = [j for _, j in settled if j.is_likelier(alone)]
+        if any(_same(problem, poses, j.poses) for j in believed):
             break
-        if any(_same(problem, poses, other) for other in tried):
-            continue
-        tried.append(poses)
-        _add(problem, settled, name, judge.settle(poses, kept))
-    settled.sort(key=lambda entry: (not np.any(entry[1].kept & ~trusted), entry[1].objective))
-    settled[0] = (settled[0][0], judge.supposing(settled[0][1]))
-    return settled
+        found = judge.settle(poses, kept)
+        if kept is trusted and not any(j.is_likelier(found.objective) and j.is_complete for j in believed):
+            found = judge.supposing(found)
+        settled.append((name, found))
+        nearly_all = found.strain <= 1.0 and found.kept[~trusted].mean() >= _NEARLY_ALL
+        if nearly_all or any(_same(problem, found.poses, j.poses) for j in believed):
+            break
+    return sorted(
+        settled, key=lambda e: (not e[1].is_likelier(alone), not np.any(e[1].kept & ~trusted), e[1].objective)
+    )
 
 
 def _routes(
-    problem: PoseGraphProblem,
-    trusted: Mask,
-    odometry: Array,
-    plain: Array | None,
-    gnc: Decision,
-    progress: Progress | None,
+    problem: PoseGraphProblem, trusted: Mask, odometry: Array, plain: Array | None, gnc: Decision
 ) -> Iterator[tuple[str, Array, Mask]]:
     """Yield names, poses and edges kept of what one route after the other leads to."""
     if plain is not None:
         yield "all edges", plain, np.ones_like(trusted)
+    scale = float(np.quantile(problem.edge_chi2(odometry)[~trusted], _QUANTILE))
+    led_to = kernel_route(problem, trusted, odometry, "dcs", scale, True)
+    if led_to is not None:
+        yield "dcs", led_to[0], trusted | (led_to[1] >= _IN)
     assert gnc.poses is not None
     yield gnc.reason, gnc.poses, gnc.weights > 0.0
-    errors = problem.edge_chi2(odometry)[~trusted]
-    for kernel, quantile in _ROUTES:
-        scale = float(np.quantile(errors, quantile))
-        led_to = kernel_route(problem, trusted, odometry, kernel, scale, True, progress)
-        if led_to is not None:
-            poses, weights = led_to
-            yield f"{kernel} from the nearest {quantile:.0%}", poses, trusted | (weights >= _IN)
+    yield "odometry", odometry, trusted
 
 
 def _lowest(problem: PoseGraphProblem, poses: Array, kept: Mask) -> Array:
@@ -233,31 +221,18 @@ def _lowest(problem: PoseGraphProblem, poses: Array, kept: Mask) -> Array:
     return min(ends, key=lambda end: end.costs[-1]).poses
 
 
-def _add(problem: PoseGraphProblem, settled: list[tuple[str, Judgement]], name: str, judgement: Judgement) -> None:
-    """Add a solution, or put it in the place of a less likely one that is the same."""
-    for i, (_, other) in enumerate(settled):
-        if _same(problem, other.poses, judgement.poses):
-            if judgement.objective < other.objective:
-                settled[i] = (name, judgement)
-            return
-    settled.append((name, judgement))
-
-
 def _same(problem: PoseGraphProblem, one: Array, other: Array) -> bool:
     d = problem.dimension
     apart = float(np.sqrt(np.mean(np.sum((one - other)[:, :d, d] ** 2, axis=1))))
     return apart <= _SAME_PLACE * extent(problem, one)
 
 
-def _disputed(judge: Judge, best: Judgement, rivals: list[tuple[str, Judgement]]) -> Mask:
-    """Return edges [E] over which a rival contradicts the best solution, where the places do not clearly decide."""
+def _disputed(best: Judgement, rivals: list[Judgement]) -> Mask:
+    """Return edges [E] over which a rival contradicts the best solution and is hardly less likely."""
     out = np.zeros(len(best.kept), dtype=np.bool_)
-    for _, rival in rivals:
+    for rival in rivals:
         ours, theirs = best.kept & ~rival.kept, rival.kept & ~best.kept
-        apart = 0.5 * (rival.objective - best.objective)
-        if not theirs.any():
-            continue  # it believes less, and contradicts nothing
-        if apart < _APART or judge.witnesses(ours) < _CLEAR * judge.witnesses(theirs):
+        if theirs.any() and 0.5 * (rival.objective - best.objective) < _APART:
             out |= ours | theirs
     return out
 

@@ -34,7 +34,10 @@ _KNOWN = 10.0  # information times the square of the space's spread: below, a di
 _TAILS = 4.0  # times the chi-square limit: errors of real loops have heavier tails than a Gaussian
 _WORST = 0.3  # of the worst score: the loops that leave with it; a bad one makes its neighbours look bad
 _ODDS = math.log(3.0)  # a loop is believed that is three times likelier true than false: a false one harms more
-_SUPPOSED_MAX = 4  # loops, one after the other, that chance might explain as well
+_SUPPOSED_MAX = 6  # loops, one at a time, that are supposed true, the likeliest first, ...
+_HARDLY = -3.0  # ... down to these log-odds
+_CLEARLY = 16.0  # of the objective: what shows that one is true
+_SOUND = 4.0  # log-odds of a kept loop below which it may have to go before others can come
 _BACK = 2.0  # log-odds more for every time that it was taken back
 _BORDER = 1.0  # log-odds: covariances of loops nearer to a decision are computed in every round
 _CHANGED = 0.05  # of the loops kept: as many changes, and those of all are
@@ -64,7 +67,17 @@ class Judgement:
     objective: float  # minus twice the logarithm of the marginal likelihood: lower explains more
     evidence: Array  # [E] log-odds that an edge is true; inf of those trusted
     leverage: Array  # [E] share of a kept loop in its own estimate: near 1 nothing else confirms it; 0: left out
+    strain: float  # mean square of odometry's errors in its standard deviations: above 1, loops contradict it
     supposed: int = 0  # loops that were let in before anything spoke for them
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no loop that was left out might be true."""
+        return bool(np.all(self.kept | (self.evidence < _HARDLY)))
+
+    def is_likelier(self, objective: float) -> bool:
+        """Return whether it explains more than what has this objective, and does not contradict odometry."""
+        return self.strain <= 1.0 and self.objective < objective
 
 
 class Judge:
@@ -90,21 +103,23 @@ class Judge:
     def supposing(self, found: Judgement) -> Judgement:
         """Return what a settled solution grows to where loops are supposed true that nothing decides about.
 
-        Several may agree with each other. So the likeliest left out is let in, one after the other.
+        Several may agree with each other, and what is kept on as little evidence may be what contradicts them. So that
+        is taken out, and the likeliest of those left out are let in, each on its own.
         """
-        first = supposed = found
-        for _ in range(_SUPPOSED_MAX):
-            evidence = np.where(supposed.kept, -np.inf, supposed.evidence)
-            if evidence.max() <= 0.0:
-                break
-            kept = supposed.kept.copy()
-            kept[np.argmax(evidence)] = True
-            supposed = self.settle(supposed.poses, kept, 0)
-            if supposed.objective >= found.objective:
-                break
-            settled = self.settle(supposed.poses, kept)
-            if settled.objective < found.objective:
-                found = supposed = settled
+        first, best = found, None
+        while best is not found:
+            best, core = found, found
+            if best.evidence[best.kept].min() < _SOUND:
+                core = self.settle(best.poses, best.kept & (best.evidence >= _SOUND), 0)
+            evidence = np.where(best.kept, -np.inf, core.evidence)
+            for e in np.argsort(-evidence, kind="stable")[:_SUPPOSED_MAX].tolist():
+                if evidence[e] < _HARDLY or best.objective - found.objective > _CLEARLY:
+                    break
+                kept = core.kept.copy()
+                kept[e] = True
+                settled = self.settle(core.poses, kept)
+                if settled.objective < found.objective - _BORDER:
+                    found = settled
         return replace(found, supposed=int(np.count_nonzero(found.kept & ~first.kept)))
 
     def settle(self, poses: Array, kept: Mask, rounds: int = _ROUNDS_MAX) -> Judgement:
@@ -141,7 +156,9 @@ class Judge:
         _, poses, scales = self._calibrated(poses, kept, scales)
         evidence, leverage = np.full(len(kept), np.inf), np.zeros(len(kept))
         evidence[at], leverage[at] = score + _ODDS, np.where(kept[at], share, 0.0)
-        return Judgement(poses, kept, *scales, self._likelihood(poses, kept, scales), evidence, leverage)
+        trusted = np.flatnonzero(self._trusted)
+        strain = float(np.sum(self._errors(poses, self._variances(scales), trusted) ** 2) / self._dof[trusted].sum())
+        return Judgement(poses, kept, *scales, self._likelihood(poses, kept, scales), evidence, leverage, strain)
 
     def objective(self, poses: Array, kept: Mask) -> tuple[float, Array]:
         """Return the objective (see `Judgement`) of edges kept [E] and their optimum near poses."""
