@@ -147,8 +147,9 @@ def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: py
 )
 def test_a_gyroscope_of_half_the_scale_is_a_fault(who_am_i: int, named: str, lsb: str) -> None:
     clock = SteppedClock()
-    half = SensorError(scale=(0.5, 0.5, 0.5), density=(2e-4, 2e-4, 2e-4))  # without noise it would be a hung one
-    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, who_am_i=who_am_i)}, clock=clock)
+    noise = SensorError(density=(4e-3, 4e-3, 4e-3))  # without noise a sensor would be a hung one
+    half = SensorError(scale=(0.5, 0.5, 0.5), density=(2e-4, 2e-4, 2e-4))
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, noise, who_am_i=who_am_i)}, clock=clock)
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:
         findings = check_board(board, *_listen(board, 0.3, clock), bus.path)
         assert board.health() == Health.GYRO_FAULT | Health.ACCEL_FAULT, "nothing else comes of the test"
@@ -218,7 +219,8 @@ def test_an_lsm6dso32_is_told_by_gravity_or_asked_for(named: str) -> None:
     clock = SteppedClock()
 
     def turning(t_ns: int):  # type: ignore[no-untyped-def]
-        return driving(t_ns)[0], *still(t_ns)[1:]  # without noise a gyro at rest is a hung chip
+        force = (0.01 * np.sin(t_ns * 1e-8), 0.0, 9.80665)  # without noise a sensor at rest is a hung chip
+        return driving(t_ns)[0], force, *still(t_ns)[2:]
 
     bus = emulated_board("LSM6DSO32", turning, clock.now_ns, stepped=clock, seed=2, grade="exact", magnetometer="none")
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:

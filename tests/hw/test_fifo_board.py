@@ -11,10 +11,10 @@ from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import ImuSample, ImuSpan
 from vislam.hw.emulator import SteppedClock, emulated_board, emulated_bus, emulated_gy85
 from vislam.hw.fifo_board import FifoBoard
-from vislam.hw.fifo_samples import FifoStamps
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
+from vislam.hw.timing import SampleClock
 from vislam.imu import PowerUp, power_up
 from worlds.fifo_boards import FIRMWARE, KINDS, Stalled, fifo_board, inertial_chip, stamp_errors_ms
 from worlds.gy85 import board, collect, driving, errors, still
@@ -366,13 +366,13 @@ def test_random_faults_never_raise_and_never_lie() -> None:
 
 def test_stamps_increase_whatever_the_questions_find() -> None:
     rng = np.random.default_rng(5)
-    stamps, t_ns, last = FifoStamps(200.0), 10**12, 0
+    stamps, t_ns, last = SampleClock(200.0), 10**12, 0
     assert stamps.bound_ms is None
     for _ in range(3000):
         t_ns += int(rng.exponential(8e6))
         if rng.random() < 0.01:
             stamps.restart()
-        for stamp in stamps.of(int(rng.integers(1, 6)), t_ns, t_ns + int(rng.exponential(2e5))):
+        for stamp in stamps.stamps(int(rng.integers(1, 6)), t_ns, t_ns + int(rng.exponential(2e5))):
             assert stamp > last
             last = stamp
 

@@ -199,7 +199,7 @@ def test_a_magnetometer_beyond_its_range_gives_no_sample() -> None:
 
 def test_a_failed_self_test_stays_in_the_health_word() -> None:
     with board() as (driver, virtual, clock):
-        weak = VirtualAdxl345(still, clock.now_ns, self_test_g=(0.0, 0.0, 0.0))
+        weak = VirtualAdxl345(still, clock.now_ns, virtual.chips[0x53].error, self_test_g=(0.0, 0.0, 0.0))
         weak.write(bytes([0x2C, *virtual.chips[0x53].registers[0x2C:0x3A]]))
         virtual.chips[0x53] = weak
         results = {t.chip: t.passed for t in driver.run_self_tests()}

@@ -94,11 +94,11 @@ def test_one_device_with_both_is_set_up_and_read_with_the_kernel_s_stamps(tmp_pa
     assert source.rate_hz == 200.0
     begin = time.monotonic_ns()
     for k in range(50):
-        device.push(begin + k * PERIOD_NS, 100, -200, 8192, k, -k, 2 * k)
+        device.push(begin + k * PERIOD_NS, 100 + k, -200, 8192, k, -k, 2 * k)
     samples = read_all(source, 50)
     assert [s.t_ns for s in samples] == [begin + k * PERIOD_NS for k in range(50)]
     np.testing.assert_allclose(samples[7].gyro_rad_s, GYRO_SCALE * np.array([7, -7, 14]))
-    np.testing.assert_allclose(samples[7].accel_m_s2, ACCEL_SCALE * np.array([100, -200, 8192]))
+    np.testing.assert_allclose(samples[7].accel_m_s2, ACCEL_SCALE * np.array([107, -200, 8192]))
     assert source.health() == Health(0)
     assert source.counters() == {}
     assert "kernel" in source.stamped_by

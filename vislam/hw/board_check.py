@@ -40,7 +40,7 @@ def check_board(
     def add(severity: Severity, what: str, next_step: str = "") -> None:
         findings.append(Finding(severity, what, where, next_step))
 
-    for test in board.run_self_tests() if isinstance(board, FifoBoard) else board.self_tests:
+    for test in board.self_tests or board.run_self_tests():
         if test.passed is None:
             add("warning", f"{test.chip}: {test.what}", test.next_step)
         elif test.passed:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -143,12 +141,9 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
 
         find_devices(Path("/"), where)
     elif kind == "serial":
-        from vislam.hw.bridge.bridge import why_not_open
+        from vislam.hw.serial_port import check_port
 
-        bridge = replace(config.serial, port=where) if where else config.serial
-        if not os.access(bridge.port, os.R_OK | os.W_OK):  # opening it would reset the board
-            code = errno.EACCES if Path(bridge.port).exists() else errno.ENOENT
-            raise HardwareError(why_not_open(bridge, OSError(code, os.strerror(code))))
+        check_port(where or config.serial.port, config.serial.baud)
     if is_library_camera(camera):
         check_library_camera(camera, config)
     elif camera != "none" and not is_video(camera):
