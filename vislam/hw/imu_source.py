@@ -98,7 +98,11 @@ class ImuSource:
     """Has of `InertialSource` all but `read` and `close`, which are a path's own."""
 
     def __init__(
-        self, calibration: SensorCalibration, silent_s: float, most_change_c: float, clock: Clock | None = None
+        self,
+        calibration: SensorCalibration,
+        silent_s: float,
+        most_change_c: float = float("inf"),
+        clock: Clock | None = None,
     ) -> None:
         """Take settings; values are rad/s, m/s^2 and uT until `_scaled`.
 

@@ -28,7 +28,7 @@ class OwnImu(ImuSource):
 
     def __init__(self, name: str, config: DepthCameraConfig) -> None:
         """Nothing is opened here: the camera does that, and calls `begin`."""
-        super().__init__(config.calibration, config.imu_silent_s, float("inf"))  # a temperature is not read
+        super().__init__(config.calibration, config.imu_silent_s)
         self.path = name
         self.rate_hz = config.imu_rate_hz
         self.stamped_by, self.problem = "not known yet", ""
