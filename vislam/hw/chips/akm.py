@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.core.messages import Array
-from vislam.hw.chips.bus import I2cBus, SettingsLostError
+from vislam.hw.chips.bus import I2cBus, kept
 from vislam.hw.chips.field import FieldReading
 from vislam.hw.chips.self_test import SelfTest
 from vislam.hw.timing import Clock
@@ -71,12 +71,10 @@ class Akm:
 
     def read(self) -> FieldReading | None:
         """Return a new measurement, None if there is none yet; never waits. Raises BusError, SettingsLostError."""
-        data = self._reads.run()
-        if data[0] != self._variant.continuous_100_hz:
-            raise SettingsLostError(f"{self.name}: mode 0x{data[0]:02x}, given 0x{self._variant.continuous_100_hz:02x}")
-        if not data[1] & _READY:
+        data = kept(self.name, self._reads.run(), bytes([self._variant.continuous_100_hz]))
+        if not data[0] & _READY:
             return None
-        counts = np.array(struct.unpack_from("<3h", data, 2), dtype=np.float64) * self._scale
+        counts = np.array(struct.unpack_from("<3h", data, 1), dtype=np.float64) * self._scale
         field_ut = _UT_PER_LSB * np.array([sign * counts[axis] for axis, sign in self._variant.turned])
         return FieldReading(field_ut, bool(data[-1] & _OVERFLOW))
 

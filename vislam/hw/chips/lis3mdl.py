@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 
-from vislam.hw.chips.bus import I2cBus, SettingsLostError
+from vislam.hw.chips.bus import I2cBus, kept
 from vislam.hw.chips.field import FieldReading
 from vislam.hw.chips.self_test import SelfTest
 from vislam.hw.timing import Clock
@@ -43,12 +43,10 @@ class Lis3mdl:
 
     def read(self) -> FieldReading | None:
         """Return a new measurement, None if there is none yet; never waits. Raises BusError, SettingsLostError."""
-        data = self._reads.run()
-        if data[:5] != self._settings:
-            raise SettingsLostError(f"{self.name}: settings {data[:5].hex()}, given {self._settings.hex()}")
-        if not data[5] & _READY:
+        data = kept(self.name, self._reads.run(), self._settings)
+        if not data[0] & _READY:
             return None
-        counts = np.array(struct.unpack_from("<3h", data, 6), dtype=np.float64)
+        counts = np.array(struct.unpack_from("<3h", data, 1), dtype=np.float64)
         return FieldReading(counts * (_UT_PER_GA / self._lsb_per_ga), bool((abs(counts) >= _LIMIT_LSB).any()))
 
     def self_test(self, clock: Clock) -> SelfTest:
