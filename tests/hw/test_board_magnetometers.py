@@ -153,7 +153,7 @@ def test_one_inside_is_silent_until_the_chip_around_lets_it_through() -> None:
 def test_an_lis3mdl_takes_the_range_that_is_asked_for_and_notices_lost_settings() -> None:
     clock = SteppedClock()
     chip = VirtualLis3mdl(driving, clock.now_ns)
-    bus = EmulatedBus({0x1C: chip}, clock=clock)
+    bus = EmulatedBus({0x1C: chip}, stepped=clock)
     with emulated_bus(bus):
         for range_ga, code in ((1.9, 0x00), (8.0, 0x20), (30.0, 0x60)):
             driver = Lis3mdl(I2cBus(bus.path, 0.02), range_ga)
@@ -173,7 +173,7 @@ def test_an_lis3mdl_takes_the_range_that_is_asked_for_and_notices_lost_settings(
 def test_the_fuses_of_an_ak8963_are_its_sensitivity() -> None:
     clock = SteppedClock()
     chip = VirtualAkm(still, clock.now_ns, variant="AK8963", fuses=(60, 128, 255))
-    bus = EmulatedBus({0x0C: chip}, clock=clock)
+    bus = EmulatedBus({0x0C: chip}, stepped=clock)
     with emulated_bus(bus):
         driver = Akm(I2cBus(bus.path, 0.02), AK8963)
         driver.configure(clock)

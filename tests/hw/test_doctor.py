@@ -87,7 +87,7 @@ def test_a_chip_that_the_kernel_owns(tmp_path: Path) -> None:
 def test_a_slow_bus_gets_the_line_for_the_boot_file(tmp_path: Path) -> None:
     clock = SteppedClock()
     bus = emulated_gy85(still, clock.now_ns, stepped=clock)
-    slow = EmulatedBus(bus.chips, bus.path, clock=clock, bus_hz=100_000.0)
+    slow = EmulatedBus(bus.chips, bus.path, stepped=clock, bus_hz=100_000.0)
     text = said(examined(slow, clock, root=tmp_path), "warning")
     assert "the bus runs at 100 kHz" in text
     assert "i2c_arm_baudrate=400000" in text

@@ -19,8 +19,8 @@ from vislam.hw.chips.imus import KNOWN_IMUS
 from vislam.hw.chips.mpu6050 import Mpu6050
 from vislam.hw.doctor import HardwareReport, Wanted, _listen, examine
 from vislam.hw.emulator import EmulatedBus, SensorError, SteppedClock, VirtualMpu6050, emulated_board, emulated_bus
+from vislam.hw.emulator.board import _KINDS
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
-from vislam.hw.emulator.fifo_board import _KINDS
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.health import Health
 from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
@@ -149,7 +149,7 @@ def test_a_gyroscope_of_half_the_scale_is_a_fault(who_am_i: int, named: str, lsb
     clock = SteppedClock()
     noise = SensorError(density=(4e-3, 4e-3, 4e-3))  # without noise a sensor would be a hung one
     half = SensorError(scale=(0.5, 0.5, 0.5), density=(2e-4, 2e-4, 2e-4))
-    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, noise, who_am_i=who_am_i)}, clock=clock)
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, noise, who_am_i=who_am_i)}, stepped=clock)
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:
         findings = check_board(board, *_listen(board, 0.3, clock), bus.path)
         assert board.health() == Health.GYRO_FAULT | Health.ACCEL_FAULT, "nothing else comes of the test"
@@ -183,7 +183,7 @@ def test_a_clone_is_tested_again_where_a_wire_was_disturbed(monkeypatch: pytest.
 
     monkeypatch.setattr(Mpu6050, "self_test", disturbed)
     clock = SteppedClock()
-    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, who_am_i=0x98)}, clock=clock)
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, who_am_i=0x98)}, stepped=clock)
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named="mpu6050-clone")) as board:
         assert ["gravity" in test.what for test in board.self_tests] == [True, False]
 

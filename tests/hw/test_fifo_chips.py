@@ -66,7 +66,7 @@ def alone(
     own = {k: options.pop(k) for k in ("who_am_i", "gyro", "accel") if k in options}
     chip = virtual(options.pop("truth", still), clock.now_ns, **own)
     address = 0x6A if issubclass(virtual, VirtualLsm6dsox) else 0x69 if virtual is VirtualIcm20948 else 0x68
-    bus = EmulatedBus({address: chip}, clock=clock, **options)
+    bus = EmulatedBus({address: chip}, stepped=clock, **options)
     with emulated_bus(bus):
         made = driver(I2cBus(bus.path, 0.02), setup)
         if is_configured:
@@ -138,7 +138,7 @@ def test_the_oscillator_s_own_error_is_taken_from_the_chip() -> None:
     clock = SteppedClock()
     for raw, share in ((0x7F, 0.1905), (0x80, -0.192), (0xFF, -0.0015)):
         chip = VirtualLsm6dsox(still, clock.now_ns, SensorError(rate_error=share))
-        bus = EmulatedBus({0x6A: chip}, clock=clock)
+        bus = EmulatedBus({0x6A: chip}, stepped=clock)
         with emulated_bus(bus):
             driver = lsm6dsox.Lsm6dsox(I2cBus(bus.path, 0.02), SETUP)
             driver.configure(clock)
@@ -299,7 +299,7 @@ def test_a_chip_that_never_leaves_its_reset_is_refused() -> None:
 def test_a_transfer_that_breaks_off_is_a_bus_error() -> None:
     clock = SteppedClock()
     chip = VirtualMpu6050(still, clock.now_ns)
-    bus = EmulatedBus({0x68: chip}, clock=clock)
+    bus = EmulatedBus({0x68: chip}, stepped=clock)
     with emulated_bus(bus):
         counts: Counter[str] = Counter()
         driver = mpu6050.Mpu6050(I2cBus(bus.path, 0.02, counts), SETUP)
@@ -354,7 +354,7 @@ def test_what_the_rate_about_z_leaks_into_x_of_a_bmi270_is_taken_off(tmp_path: P
     clock = SteppedClock()
     chip = VirtualBmi270(turning, clock.now_ns)
     chip.cas = cas
-    with emulated_bus(EmulatedBus({0x68: chip}, clock=clock)) as bus:
+    with emulated_bus(EmulatedBus({0x68: chip}, stepped=clock)) as bus:
         driver = bmi270.Bmi270(I2cBus(bus.path, 0.02), replace(SETUP, firmware=str(file)))
         driver.configure(clock)
         clock.advance(100_000_000)
