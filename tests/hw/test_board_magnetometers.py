@@ -11,8 +11,8 @@ from vislam.config import BoardConfig, Gy85Config, SensorCalibration
 from vislam.core.messages import MagSample
 from vislam.hw.chips import I2cBus, SettingsLostError
 from vislam.hw.chips.akm import AK8963, Akm
+from vislam.hw.chips.known import find_any_magnetometer
 from vislam.hw.chips.lis3mdl import Lis3mdl
-from vislam.hw.chips.magnetometer import find_any_magnetometer
 from vislam.hw.emulator import (
     EmulatedBus,
     SteppedClock,
@@ -175,7 +175,7 @@ def test_the_fuses_of_an_ak8963_are_its_sensitivity() -> None:
     chip = VirtualAkm(still, clock.now_ns, variant="AK8963", fuses=(60, 128, 255))
     bus = EmulatedBus({0x0C: chip}, stepped=clock)
     with emulated_bus(bus):
-        driver = Akm(I2cBus(bus.path, 0.02), AK8963)
+        driver = Akm(AK8963, I2cBus(bus.path, 0.02))
         driver.configure(clock)
         clock.advance(30_000_000)
         reading = driver.read()

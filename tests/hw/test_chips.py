@@ -8,7 +8,7 @@ from vislam.hw.chips.adxl345 import Adxl345, self_test_limits_lsb
 from vislam.hw.chips.bus import I2cBus, SettingsLostError
 from vislam.hw.chips.hmc5883l import Hmc5883l
 from vislam.hw.chips.itg3205 import Itg3205
-from vislam.hw.chips.magnetometer import find_magnetometer
+from vislam.hw.chips.known import find_magnetometer
 from vislam.hw.emulator import (
     EmulatedBus,
     SensorError,

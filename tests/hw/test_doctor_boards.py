@@ -15,7 +15,7 @@ from vislam.config import BoardConfig, Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.hw.board_check import check_board
 from vislam.hw.chips import BusError, I2cBus, identify
-from vislam.hw.chips.imus import KNOWN_IMUS
+from vislam.hw.chips.known import KNOWN_IMUS
 from vislam.hw.chips.mpu6050 import Mpu6050
 from vislam.hw.doctor import HardwareReport, Wanted, _listen, examine
 from vislam.hw.emulator import EmulatedBus, SensorError, SteppedClock, VirtualMpu6050, emulated_board, emulated_bus

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from vislam.core.errors import HardwareError
 from vislam.hw.chips import BusError, I2cBus, ImuSetup, SettingsLostError, bmi270, icm20948, identify, lsm6dsox, mpu6050
 from vislam.hw.chips.fifo_imu import divided, next_of
-from vislam.hw.chips.imus import find_imu
+from vislam.hw.chips.known import find_imu
 from vislam.hw.emulator import (
     EmulatedBus,
     FifoChip,

@@ -22,7 +22,7 @@ from vislam.hw.chips import (
     mpu6050,
 )
 from vislam.hw.chips.fifo_imu import G_M_S2, SAMPLES, SATURATED_LSB, RawSamples, fresh
-from vislam.hw.chips.magnetometer import find_any_magnetometer
+from vislam.hw.chips.known import find_any_magnetometer
 from vislam.hw.health import Health
 from vislam.hw.link import Link, refuse_shared
 from vislam.hw.timing import Clock, SampleClock

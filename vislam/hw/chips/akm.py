@@ -48,8 +48,8 @@ class Akm:
 
     rate_hz = 100.0
 
-    def __init__(self, bus: I2cBus, variant: Variant) -> None:
-        """Take settings; nothing is sent yet. The range is fixed, 4.9 mT."""
+    def __init__(self, variant: Variant, bus: I2cBus, range_ga: float = 0.0, address: int = ADDRESS) -> None:
+        """Take settings; nothing is sent yet. Range and address are fixed: 4.9 mT."""
         self._bus, self._variant, self.name = bus, variant, variant.name
         self._reads = bus.prepare([(ADDRESS, variant.control, 1), (ADDRESS, variant.status, variant.length)])
         self._scale: Array = np.ones(3)

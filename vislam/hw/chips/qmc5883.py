@@ -49,8 +49,8 @@ class Qmc5883:
 
     rate_hz = 100.0
 
-    def __init__(self, bus: I2cBus, range_ga: float, variant: Variant) -> None:
-        """Take settings; nothing is sent yet."""
+    def __init__(self, variant: Variant, bus: I2cBus, range_ga: float, address: int = 0) -> None:
+        """Take settings; nothing is sent yet. The address is the variant's."""
         self._bus, self._variant = bus, variant
         wide = range_ga > _NARROW_GA
         self._setup = variant.wide if wide else variant.narrow
