@@ -17,7 +17,7 @@ _ASKED_TIMES = 3  # a chip that does not answer may have been disturbed
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """A chip, or a family with one register map, and how it says who it is."""
+    """A chip, or a family with one register map, and how it identifies itself."""
 
     addresses: tuple[int, ...]
     register: int
