@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from vislam.config import BoardConfig, PowerUpConfig, SensorCalibration
+from vislam.config import BoardConfig, SensorCalibration
 from vislam.core.errors import HardwareError, UsageError
-from vislam.core.messages import ImuSpan
 from vislam.hw.emulator import SteppedClock, emulated_bus, emulated_gy85
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.health import Health
 from vislam.hw.source import InertialSource
 from vislam.hw.timing import SampleClock
-from vislam.imu import PowerUp, power_up
 from worlds.fifo_boards import KINDS, fifo_board, inertial_chip, stamp_errors_ms
 from worlds.gy85 import collect, driving, errors, still
 
@@ -82,23 +80,6 @@ def test_the_chip_lies_as_its_axes_say() -> None:
         gyro, accel = errors(collect(driver, clock, 2.0)[0][100:])
         assert abs(gyro).mean() < 5e-4
         assert abs(accel).mean() < 5e-3
-
-
-def test_power_up_finds_bias_and_level_as_on_a_gy85() -> None:
-    def level(t_ns: int):  # type: ignore[no-untyped-def]
-        return (0.0, 0.0, 0.0), (0.17, -0.34, 9.80185), (20.0, 0.0, -42.0), 30.0
-
-    with fifo_board("LSM6DSOX", truth=level) as (driver, virtual, clock):
-        error = inertial_chip(virtual).error
-        bias = np.array(error.bias) + 5.0 * np.array(error.bias_per_c)
-        samples, _ = collect(driver, clock, 3.0)
-        t_ns = np.array([s.t_ns for s in samples], dtype=np.int64)
-        rates, forces = np.array([s.gyro_rad_s for s in samples]), np.array([s.accel_m_s2 for s in samples])
-        found = power_up(ImuSpan(t_ns, rates, forces), PowerUpConfig(), 9.81, driver.temperature_c)
-        assert isinstance(found, PowerUp)
-        np.testing.assert_allclose(found.gyro_bias_rad_s, bias, atol=5e-4)
-        np.testing.assert_allclose(found.R_level_body @ [0.17, -0.34, 9.80185], [0.0, 0.0, 9.81], atol=0.1)
-        assert found.temperature_c == pytest.approx(30.0, abs=0.1)
 
 
 def test_what_is_in_the_place_of_a_chip_is_told() -> None:

@@ -111,16 +111,6 @@ def test_noise_comes_through_with_the_density_of_the_data_sheets() -> None:
     assert 0.5 < ratios.accel_typical < 1.3
 
 
-def test_magnetic_samples_come_at_their_rate_in_time_order() -> None:
-    with board(magnetometer="HMC5883L") as (driver, _, clock):
-        inertial, magnetic = collect(driver, clock, 10.0)
-        steps = np.diff([m.t_ns for m in magnetic])
-        assert len(magnetic) == pytest.approx(490, abs=15)
-        assert (steps > 0).all()
-        assert (np.diff([s.t_ns for s in inertial]) > 0).all()
-        np.testing.assert_allclose(np.mean([m.field_ut for m in magnetic], axis=0), FIELD_UT, atol=2.0)
-
-
 def test_self_tests_run_at_the_start_and_disturb_nothing() -> None:
     with board(truth=still, config=Gy85Config()) as (driver, _, clock):
         assert [(t.chip, t.passed) for t in driver.self_tests] == [("ADXL345", True), ("HMC5883L", True)]
