@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -403,41 +404,32 @@ def test_a_chip_that_goes_away_and_comes_back(config: SerialConfig, board: Bridg
     bridge.close()
 
 
-def test_a_magnetometer_that_gives_the_same_for_ever_is_named_and_not_used(
-    config: SerialConfig, board: BridgeEmulator
+@pytest.mark.parametrize(
+    ("name", "fault", "kind", "value", "most"),
+    [
+        ("gyro", LineFaults(frozen=True), ImuSample, (1, 2, 3), 20),
+        ("accel", LineFaults(frozen_accel=True), ImuSample, (1, 2, 250), 20),
+        ("mag", LineFaults(frozen_mag=True), MagSample, (200, -400, 8), 10),
+    ],
+)
+def test_a_sensor_that_hangs_is_a_fault_and_not_used(
+    config: SerialConfig, board: BridgeEmulator, name: str, fault: LineFaults, kind: Any, value: Any, most: int
 ) -> None:
+    hello, bit = bridged("GY-85").hello, Health[f"{name.upper()}_FAULT"]
+    unit = {"gyro": hello.gyro_nrad_s * 1e-9, "accel": hello.accel_nm_s2 * 1e-9, "mag": hello.mag_pt * 1e-6}[name]
+    field = {"gyro": "gyro_rad_s", "accel": "accel_m_s2", "mag": "field_ut"}[name]
     bridge = SerialBridge(config)
-    collect(bridge, lambda found: any(isinstance(sample, MagSample) for sample in found))
-    assert Health.MAG_FAULT not in bridge.health()
-    board.faults = LineFaults(frozen_mag=True)
-    collect(bridge, lambda _: bridge.counters().get("mag_stuck", 0) > 0)
-    samples = collect(bridge, lambda found: len(found) > 100)
-    assert Health.MAG_FAULT in bridge.health()
-    assert not any(isinstance(sample, MagSample) for sample in samples)
-    board.faults = LineFaults()
-    collect(bridge, lambda found: any(isinstance(sample, MagSample) for sample in found))
-    assert Health.MAG_FAULT not in bridge.health()
-    bridge.close()
-
-
-@pytest.mark.parametrize("name", ["gyro", "accel"])
-def test_a_chip_that_hangs_is_a_fault_and_not_integrated(
-    config: SerialConfig, board: BridgeEmulator, name: str
-) -> None:
-    fault = Health.GYRO_FAULT if name == "gyro" else Health.ACCEL_FAULT
-    hello = bridged("GY-85").hello
-    gyro, accel = np.array([1, 2, 3]) * hello.gyro_nrad_s * 1e-9, np.array([1, 2, 250]) * hello.accel_nm_s2 * 1e-9
-    bridge = SerialBridge(config)
-    collect(bridge, lambda found: len(imu(found)) > 200)
+    collect(bridge, lambda found: len(imu(found)) > 200 and any(isinstance(sample, MagSample) for sample in found))
     assert bridge.health() & (Health.GYRO_FAULT | Health.ACCEL_FAULT | Health.MAG_FAULT | Health.BUS_FAULT) == 0
-    board.faults = LineFaults(frozen=name == "gyro", frozen_accel=name == "accel")
-    samples = imu(collect(bridge, lambda _: bridge.counters().get(f"{name}_stuck", 0) > 10))
-    held = [s for s in samples if np.allclose(s.gyro_rad_s, gyro) or np.allclose(s.accel_m_s2, accel)]
-    assert len(held) == 20, "50 ms of what is no motion"
-    assert fault | Health.IMU_GAP in bridge.health()
+    board.faults = fault
+    samples = collect(bridge, lambda _: bridge.counters().get(f"{name}_stuck", 0) > 10)
+    given = [s for s in samples if isinstance(s, kind) and np.allclose(getattr(s, field), np.array(value) * unit)]
+    assert len(given) == most, "of gyro and accelerometer 50 ms of what is no motion, of the field 0.2 s"
+    assert bit in bridge.health()
     board.faults = LineFaults()
-    collect(bridge, lambda found: len(imu(found)) > 10)
-    assert fault not in bridge.health()
+    collect(bridge, lambda found: sum(isinstance(sample, kind) for sample in found) > 10)
+    bridge.health()
+    assert bit not in bridge.health()
     bridge.close()
 
 

@@ -115,15 +115,6 @@ def test_a_board_that_moves_is_not_approved_of(tmp_path: Path) -> None:
     assert "10 allowed" in said(examined("LSM6DSOX", tmp_path, turning), "warning")
 
 
-def test_a_chip_that_the_kernel_owns_is_left_alone(tmp_path: Path) -> None:
-    device, driver = tmp_path / "sys/bus/i2c/devices/7-006a", tmp_path / "sys/bus/i2c/drivers/st_lsm6dsx_i2c"
-    device.mkdir(parents=True)
-    driver.mkdir(parents=True)
-    (device / "driver").symlink_to(driver)
-    report = examined("LSM6DSOX", tmp_path, path="/dev/i2c-7")
-    assert "echo 7-006a | sudo tee /sys/bus/i2c/drivers/st_lsm6dsx_i2c/unbind" in said(report, "error")
-
-
 def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(_KINDS, "MPU-6050", (VirtualMpu6050, 0x98, 0x68, 0.005, 400.0))
     path = "/dev/i2c-emulated"

@@ -13,8 +13,7 @@ import numpy as np
 
 from vislam.core.messages import Array
 from vislam.hw.chips.bus import I2cBus, kept
-from vislam.hw.chips.field import FieldReading
-from vislam.hw.chips.self_test import SelfTest
+from vislam.hw.chips.field import FieldReading, Magnetometer
 from vislam.hw.timing import Clock
 
 ADDRESS = 0x0C
@@ -43,7 +42,7 @@ AK09916 = Variant("AK09916", 0x01, 0x09, 0x10, 9, 0x31, 0x08, None, ((0, 1), (1,
 AK8963 = Variant("AK8963", 0x00, 0x48, 0x02, 8, 0x0A, 0x16, 0x10, ((1, 1), (0, 1), (2, -1)))
 
 
-class Akm:
+class Akm(Magnetometer):
     """One chip of either kind, measuring at 100 Hz."""
 
     rate_hz = 100.0
@@ -77,7 +76,3 @@ class Akm:
         counts = np.array(struct.unpack_from("<3h", data, 1), dtype=np.float64) * self._scale
         field_ut = _UT_PER_LSB * np.array([sign * counts[axis] for axis, sign in self._variant.turned])
         return FieldReading(field_ut, bool(data[-1] & _OVERFLOW))
-
-    def self_test(self, clock: Clock) -> SelfTest:
-        """Return that none is run."""
-        return SelfTest(self.name, None, "its self-test is not run; the field's plausibility is checked")
