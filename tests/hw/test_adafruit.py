@@ -13,8 +13,8 @@ from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.adafruit import AdafruitImu, open_adafruit
 from vislam.hw.emulator import SteppedClock
 from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.sensors import check_devices, open_inertial
-from vislam.hw.source import InertialSource
 from worlds.gy85 import FIELD_UT, driving
 
 TRANSFER_NS = 400_000

@@ -8,7 +8,7 @@ from vislam.core.errors import HardwareError, UsageError
 from vislam.hw.emulator import SteppedClock, emulated_bus, emulated_gy85
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.health import Health
-from vislam.hw.source import InertialSource
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.timing import SampleClock
 from worlds.fifo_boards import KINDS, fifo_board, inertial_chip, stamp_errors_ms
 from worlds.gy85 import collect, driving, errors, still

@@ -9,7 +9,7 @@ from vislam.core.imu_noise import ImuNoise
 from vislam.core.messages import ImuSample, ImuSpan
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
-from vislam.hw.source import InertialSource
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.timing import SampleClock
 from vislam.imu import NoiseFloor, PowerUp, Refusal, power_up
 from worlds.gy85 import FIELD_UT, board, collect, driving, errors, still

@@ -12,7 +12,7 @@ from vislam.config import Gy85Config
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.emulator import EmulatedBus, SteppedClock, Truth, emulated_bus, emulated_gy85
 from vislam.hw.gy85 import Gy85
-from vislam.hw.source import InertialSource
+from vislam.hw.imu_source import InertialSource
 
 FIELD_UT = np.array([20.0, -5.0, -42.0])
 

@@ -11,7 +11,7 @@ from vislam.config import BoardConfig
 from vislam.core.errors import HardwareError, UsageError, install_line
 from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.health import Health
-from vislam.hw.imu_source import ImuSource
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.timing import Clock, read_in_rounds
 
 MAX_RATE_HZ = 200.0  # each sample costs such a driver two or three transfers and some hundred lines of Python
@@ -21,8 +21,8 @@ _TEMPERATURE_S = 0.5  # between looks at the temperature
 _BNO_REPORTS = {"acceleration": 0x01, "gyro": 0x02, "magnetic": 0x03}  # calibrated ones, by the BNO08X data sheet
 
 
-class AdafruitImu(ImuSource):
-    """Satisfies `InertialSource` with a driver object's `acceleration` (m/s^2), `gyro` (rad/s) and `magnetic` (uT).
+class AdafruitImu(InertialSource):
+    """An `InertialSource` with a driver object's `acceleration` (m/s^2), `gyro` (rad/s) and `magnetic` (uT).
 
     Stamps are the host's, in the middle between asking for the first value and having the second: such drivers give
     no time, and so the stamps jitter as the machine does. Values that are the last ones again are no new sample: chips

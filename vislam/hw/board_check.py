@@ -9,6 +9,7 @@ from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.own_imu import OwnImu
 
 Add = Callable[..., None]
@@ -103,15 +104,14 @@ def check_rest(inertial: list[ImuSample], where: str, max_rate_deg_s: float = MA
     return findings
 
 
-def check_stamps(source: object, where: str) -> list[Finding]:
+def check_stamps(source: InertialSource, where: str) -> list[Finding]:
     """Return where the stamps of an inertial source come from and, where that is known, how far they can be off."""
-    stamped_by = getattr(source, "stamped_by", None)
-    if stamped_by is None:
+    if not source.stamped_by:
         return []
     bound_ms = getattr(source, "stamp_bound_ms", None)
     bound = "" if bound_ms is None else f", known to about {bound_ms:.2f} ms"
     findings, add = _adding(where)
-    add("ok", f"stamped by {stamped_by}{bound}")
+    add("ok", f"stamped by {source.stamped_by}{bound}")
     for kind, stand_in, real in (
         (FifoBoard, "an emulator written from the data sheet", "chip"),
         (OwnImu, "a stand-in for its library", "device"),

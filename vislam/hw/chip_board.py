@@ -7,13 +7,13 @@ from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.board_magnetometer import BoardMagnetometer
 from vislam.hw.chips import I2cBus, Magnetometer, SelfTest
 from vislam.hw.health import Health
-from vislam.hw.imu_source import ImuSource, Watch
+from vislam.hw.imu_source import InertialSource, Watch
 from vislam.hw.link import ChipLinks, Link
 from vislam.hw.timing import Clock, read_in_rounds
 
 
-class ChipBoard(ImuSource):
-    """Satisfies `InertialSource` for a board that fills `_round`. One thread only.
+class ChipBoard(InertialSource):
+    """An `InertialSource` for a board that fills `_round`. One thread only.
 
     Transfers are bounded, which is what a call may take longer than asked.
 

@@ -21,6 +21,7 @@ from vislam.hw.cameras.webcam import Capture, Webcam
 from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command, use_clone
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.library_cameras import (
     WITH_IMU,
     gives_frames,
@@ -32,7 +33,7 @@ from vislam.hw.library_cameras import (
 )
 from vislam.hw.link import BUS_TIMEOUT_S
 from vislam.hw.sensors import open_inertial
-from vislam.hw.source import CapturedImage, InertialSource
+from vislam.hw.source import CapturedImage
 from vislam.hw.timing import Clock, HostClock
 
 _NS = 1_000_000_000

@@ -53,7 +53,7 @@ def scale_test(imu: FifoImu, force_m_s2: float | None) -> SelfTest:
 
 
 class FifoBoard(ChipBoard):
-    """Satisfies `InertialSource`. The chip paces gyro and accelerometer; its FIFO has how many samples are new.
+    """An `InertialSource`. The chip paces gyro and accelerometer; its FIFO has how many samples are new.
 
     Stamps are those of the chip's clock as the counts place it in the host's, less the delay of the gyro's filter; the
     accelerometer is interpolated to them. A host that comes late loses nothing until the FIFO is full. See `ChipBoard`.

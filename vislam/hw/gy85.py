@@ -32,7 +32,7 @@ _KEPT = 128  # samples of one chip that wait for the other
 
 
 class Gy85(ChipBoard):
-    """Satisfies `InertialSource`. The gyro is the master of time; accelerometer samples are interpolated to its stamps.
+    """An `InertialSource`. The gyro is the master of time; accelerometer samples are interpolated to its stamps.
 
     Stamps are those of the middle of what the gyro's filter lets through, some milliseconds before the transfer, by
     when newer accelerometer samples are there: a sample is given out in the call that captured it. A magnetometer

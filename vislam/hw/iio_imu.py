@@ -9,7 +9,7 @@ from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.accel_at_gyro import AccelAtGyro
 from vislam.hw.health import Health
 from vislam.hw.iio_device import KINDS, IioDevice, Scans, kinds_of
-from vislam.hw.imu_source import ImuSource
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.timing import wall_ahead_ns
 
 _NS = 1_000_000_000
@@ -18,8 +18,8 @@ _KEPT = 2000  # samples of one sensor that wait for the other: ten seconds at 20
 _FAR_NS = 2 * _NS  # a stamp so far from now is of another clock
 
 
-class IioImu(ImuSource):
-    """Satisfies `InertialSource` with one device of gyro and accelerometer, or with one of each.
+class IioImu(InertialSource):
+    """An `InertialSource` with one device of gyro and accelerometer, or with one of each.
 
     Stamps are the kernel's, taken at the chip's interrupt; `config.delay_s` is taken off (the kernel does not have the
     delay of a filter: None is none). Where gyro and accelerometer are devices of their own, the accelerometer is

@@ -94,8 +94,16 @@ class Watch:
         return sound
 
 
-class ImuSource:
-    """Has of `InertialSource` all but `read` and `close`, which are a path's own."""
+class InertialSource:
+    """An IMU, and its magnetometer if any, that yields calibrated body-frame samples stamped at capture.
+
+    Attributes:
+        rate_hz: samples per second.
+        stamped_by: where the stamps come from, for a person; empty: not stated.
+    """
+
+    rate_hz: float
+    stamped_by = ""
 
     def __init__(
         self,
@@ -130,11 +138,27 @@ class ImuSource:
         return self._temperature_c
 
     def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Take the drift from a temperature on off; see `InertialSource`. TEMPERATURE_DRIFT is set when it is far."""
+        """Set at which temperature biases were taken, and by how much [3] the gyro's change per deg C (rad/s).
+
+        From then on samples come without that drift, so that an estimator's bias stays what it was there.
+        TEMPERATURE_DRIFT is set when it is far.
+        """
         self._zero_c, self._per_c = temperature_c, np.asarray(gyro_per_c)
 
+    def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
+        """Return what was captured since the last call, in time order (CLOCK_MONOTONIC ns).
+
+        Waits at most `timeout_s` for the first one; an empty list: none came, and `health` has the reason. A sensor
+        that went away is looked for again in later calls. Never raises for what a plug or a cable can cause.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Give the device back; may be called twice."""
+        raise NotImplementedError
+
     def health(self) -> Health:
-        """Return the sensor bits that hold now and the events since the last call."""
+        """Return the sensor bits that hold now; passing events (a gap, saturation) stay set until this call."""
         word = self._faults.taken()
         for watch in (self._gyro, self._accel, self._field):
             word |= watch.fault if watch.is_stuck else _NOTHING

@@ -11,15 +11,15 @@ from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.accel_at_gyro import AccelAtGyro
 from vislam.hw.affine import Affine
 from vislam.hw.health import Health
-from vislam.hw.imu_source import ImuSource
+from vislam.hw.imu_source import InertialSource
 
 _NS = 1_000_000_000
 _KEPT = 4000  # samples that wait to be taken: 20 s at 200 Hz
 _GAP_PERIODS = 2.5  # between two samples of the gyro; beyond, some were lost
 
 
-class OwnImu(ImuSource):
-    """Satisfies `InertialSource`; any thread may put in, one takes out.
+class OwnImu(InertialSource):
+    """An `InertialSource`; any thread may put in, one takes out.
 
     Attributes:
         stamped_by: where the stamps come from, for a person.

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
     from vislam.hw.cameras.library_camera import LibraryCamera
     from vislam.hw.cameras.video import VideoCamera
-    from vislam.hw.source import CapturedImage, InertialSource
+    from vislam.hw.imu_source import InertialSource
+    from vislam.hw.source import CapturedImage
 
 # chips with a FIFO as a command line names them, and the family of each as the settings do; board: whichever answers
 CHIPS: dict[str, ImuChip | None] = {

@@ -13,7 +13,7 @@ import numpy as np
 from vislam.config import SensorCalibration
 from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.health import Health
-from vislam.hw.imu_source import ImuSource
+from vislam.hw.imu_source import InertialSource
 
 _NS = 1_000_000_000
 _RECORD = struct.Struct("<q6d")
@@ -71,8 +71,8 @@ class ImuHander:
             self._waiting.clear()
 
 
-class HandedImu(ImuSource):
-    """Satisfies `InertialSource` with what an `ImuHander` of another process sends."""
+class HandedImu(InertialSource):
+    """An `InertialSource` with what an `ImuHander` of another process sends."""
 
     def __init__(self, sock: socket.socket, rate_hz: float, silent_s: float) -> None:
         """Own the end of a pair of SOCK_SEQPACKET.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vislam.config import SensorCalibration
 from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.imu_source import ImuSource
+from vislam.hw.imu_source import InertialSource
 from vislam.live.epoch import Epoch
 
 _NS = 1_000_000_000
@@ -24,8 +24,8 @@ class InertialTable:
     rate_hz: float
 
 
-class ReplayedImu(ImuSource):
-    """Satisfies `InertialSource`; no recording has a temperature."""
+class ReplayedImu(InertialSource):
+    """An `InertialSource`; no recording has a temperature."""
 
     def __init__(self, table: InertialTable, epoch: Epoch, outages: tuple[tuple[float, float], ...] = ()) -> None:
         """Play a table from the epoch on; it is unplugged in each of `outages`, seconds since then."""

@@ -28,7 +28,7 @@ from vislam.hw.bridge.protocol import (
     Status,
 )
 from vislam.hw.health import Health
-from vislam.hw.imu_source import ImuSource
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.serial_port import SerialPort
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ _NOMINAL_HZ = 400.0  # until the device states it
 _TEMPERATURE_TAU_S = 1.0  # its counts are noisy, its changes slow
 
 
-class SerialBridge(ImuSource):
-    """Satisfies `InertialSource`. Frames come from firmware/vislam_bridge; see `protocol`.
+class SerialBridge(InertialSource):
+    """An `InertialSource`. Frames come from firmware/vislam_bridge; see `protocol`.
 
     What a plug, a cable or a wrong port can cause is in `health`, `counters` and, in words, `problem`. A port that
     goes away is looked for every `config.reopen_s`; one that gives no sample for `config.start_s` is opened again,

@@ -16,8 +16,8 @@ from vislam.core.errors import HardwareError
 from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.emulator import BridgeEmulator, LineFaults, SteppedClock, Truth, emulated_bus, emulated_gy85, gy85_errors
 from vislam.hw.gy85 import Gy85
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.sensors import open_inertial
-from vislam.hw.source import InertialSource
 from vislam.hw.timing import Clock, HostClock
 from vislam.live.epoch import Epoch
 from vislam.live.processes.child import Life
