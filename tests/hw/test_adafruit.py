@@ -150,6 +150,20 @@ def test_values_that_are_none_make_no_sample(value: Any) -> None:
     assert source.counters()["bad_values"] > 20
 
 
+def test_an_accelerometer_that_hangs_alone_is_named_and_not_integrated() -> None:
+    class Hung(Driver):
+        @property
+        def acceleration(self) -> Any:
+            self._clock.advance(TRANSFER_NS)
+            return 0.0, 0.0, 9.8
+
+    clock = SteppedClock()
+    source = AdafruitImu(Hung(clock), BoardConfig(), clock)
+    assert len(collected(source, clock, 1.0)[0]) == 20
+    assert set(source.counters()) == {"accel_stuck"}
+    assert source.health() == Health.ACCEL_FAULT | Health.IMU_GAP | Health.IMU_MISSING
+
+
 def test_one_that_gives_the_same_for_ever_is_missing_and_made_anew() -> None:
     clock = SteppedClock()
     driver = Driver(clock)

@@ -19,6 +19,7 @@ class AccelAtGyro:
         """Keep at most `keep` samples of one that wait for the other."""
         self._gyro: deque[tuple[int, Any]] = deque(maxlen=keep)
         self._accel: deque[tuple[int, Any]] = deque(maxlen=keep)
+        self._complete: list[tuple[int, Array, Array]] = []  # of before a hole
         self._last_ns = self.unpaired = 0
         self._is_flowing = False
 
@@ -32,7 +33,8 @@ class AccelAtGyro:
         self._accel.append((t_ns, force))
 
     def clear(self) -> None:
-        """Forget what waits, as after a hole."""
+        """Begin behind a hole: what waits for a sample of before it is forgotten."""
+        self._complete = self.merged()
         self._gyro.clear()
         self._accel.clear()
         self._is_flowing = False
@@ -40,7 +42,7 @@ class AccelAtGyro:
     def merged(self) -> list[tuple[int, Array, Array]]:
         """Return stamp, rate [3] and force [3] of the gyro's samples around which the accelerometer has some."""
         gyro, accel = self._gyro, self._accel
-        merged = []
+        merged, self._complete = self._complete, []
         while gyro and accel and gyro[0][0] <= accel[-1][0]:
             t_ns, rate = gyro.popleft()
             while len(accel) > 1 and accel[1][0] <= t_ns:
