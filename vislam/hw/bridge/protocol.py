@@ -9,8 +9,10 @@ The structs, flags and values below are the whole table; firmware/vislam_bridge/
 
 import binascii
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntFlag
+from functools import partial
 
 PROTOCOL_VERSION = 1
 SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE, AGES_TYPE, SPENT_TYPE = 1, 2, 3, 4, 5, 6
@@ -200,9 +202,6 @@ def parse(stuffed: bytes) -> Message | None:
     body = data[: -_CRC.size]
     if binascii.crc_hqx(body, _CRC_BEGIN) != _CRC.unpack(data[-_CRC.size :])[0]:
         return None
-    if body[0] in _PLAIN:
-        kind, layout = _PLAIN[body[0]]
-        return kind(*layout.unpack(body)[1:]) if len(body) == layout.size else None
     return _READERS[body[0]](body) if body[0] in _READERS else None
 
 
@@ -233,13 +232,22 @@ def _passed(body: bytes) -> Passed | None:
     return Passed(sequence, t_us, data) if len(data) <= MOST_PASSED else None
 
 
+def _plain(made: type[Counts | Ages | Spent], layout: struct.Struct, body: bytes) -> Counts | Ages | Spent | None:
+    return made(*layout.unpack(body)[1:]) if len(body) == layout.size else None
+
+
 _ALL_STATUS = sum(Status)
-_READERS = {SAMPLE_TYPE: _sample, HELLO_TYPE: _hello, PASSED_TYPE: _passed}
 # those whose fields stand in a frame one after the other
 _PLAIN: dict[int, tuple[type[Counts | Ages | Spent], struct.Struct]] = {
     COUNTS_TYPE: (Counts, _COUNTS),
     AGES_TYPE: (Ages, _AGES),
     SPENT_TYPE: (Spent, _SPENT),
+}
+_READERS: dict[int, Callable[[bytes], Message | None]] = {
+    SAMPLE_TYPE: _sample,
+    HELLO_TYPE: _hello,
+    PASSED_TYPE: _passed,
+    **{kind: partial(_plain, *made) for kind, made in _PLAIN.items()},
 }
 
 
