@@ -35,12 +35,10 @@ BUDGET_PRIVATE_USES = 20  # of attributes with an underscore by tests
 
 # classes beyond the limit and how long they may be, by tens: one state machine each, whose parts share most attributes
 LONG_CLASSES = {
-    "Gy85": 260,  # one board's clock, queue and faults
     "LiveRun": 270,
     "Mapper": 280,  # every product of a map
     "Run": 320,
     "RunViewer": 290,
-    "SerialBridge": 300,
 }
 
 
@@ -48,9 +46,7 @@ LONG_CLASSES = {
 MANY_ATTRIBUTES = {
     "FastPath": 28,
     "FrontProcess": 21,
-    "Gy85": 23,
     "Run": 21,
-    "SerialBridge": 23,
     "_Batch": 23,
 }
 

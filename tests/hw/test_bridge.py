@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,13 +22,14 @@ from vislam.core.errors import HardwareError
 from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.bridge import frame_gaps, protocol
 from vislam.hw.bridge.behind import Behind
-from vislam.hw.bridge.bridge import SerialBridge, why_not_open
+from vislam.hw.bridge.bridge import SerialBridge
 from vislam.hw.bridge.frame_gaps import FrameGaps
 from vislam.hw.bridge.protocol import Chips
 from vislam.hw.emulator import SensorError
 from vislam.hw.emulator import bridge as emulator
 from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults, at_rest, bridged
 from vislam.hw.health import Health
+from vislam.hw.serial_port import why_not_open
 from waiting import HUNG_S
 
 EXACT = (SensorError(), SensorError(), SensorError(density=(0.02, 0.02, 0.02)))  # a field without noise is a hung chip
@@ -64,12 +66,17 @@ def imu(samples: list) -> list[ImuSample]:
 def swinging(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
     """A motion that tells its time: 1 ms too late is 12 mrad/s off at most."""
     phase = 2.0 * math.pi * 2.0 * (t_ns % 500_000_000) * 1e-9
-    return (math.sin(phase), math.cos(phase), 0.5), (1.0, -2.0, 9.8), (20.0, -10.0, -43.0), 31.0
+    return (math.sin(phase), math.cos(phase), 0.5), (1.0 + _step(t_ns), -2.0, 9.8), (20.0, -10.0, -43.0), 31.0
+
+
+def _step(t_ns: int) -> float:
+    """A count and a half of an ADXL345 every 10 ms: a sensor that has neither motion nor noise is a hung chip."""
+    return 0.057 * (t_ns // 10_000_000 % 2)
 
 
 def trembling(t_ns: int) -> tuple[tuple, tuple, tuple, float]:
-    """At rest but for two counts of the gyro: one whose rate has neither motion nor noise is a hung chip."""
-    return (0.002 * (t_ns // 10_000_000 % 2), 0.0, 0.0), *at_rest(t_ns)[1:]
+    """At rest but for a count or two."""
+    return (0.002 * (t_ns // 10_000_000 % 2), 0.0, 0.0), (_step(t_ns), 0.0, 9.80665), *at_rest(t_ns)[2:]
 
 
 def test_samples_are_calibrated_and_stamped_at_capture(config: SerialConfig) -> None:
@@ -87,7 +94,7 @@ def test_samples_are_calibrated_and_stamped_at_capture(config: SerialConfig) -> 
     for sample in imu(samples)[300:]:
         (x, y, z), _, _, _ = swinging(sample.t_ns)
         late_rad_s.append(max(abs(sample.gyro_rad_s - [-y, x, z - 0.1])))
-        assert sample.accel_m_s2 == pytest.approx([1.1, -2.0, 9.8], abs=0.03)
+        assert sample.accel_m_s2 == pytest.approx([1.1 * 1.0285, -2.0, 9.8], abs=0.06)
     assert np.median(late_rad_s) < 0.02
     fields = [sample for sample in samples if isinstance(sample, MagSample)]
     assert len(fields) == pytest.approx(900 / 9, abs=30)
@@ -186,11 +193,11 @@ def test_no_wrong_sample_passes_a_bad_cable(config: SerialConfig) -> None:
     assert counts["bad_frames"] > 20
     assert counts["frames_lost"] > 20
     assert Health.BUS_FAULT | Health.IMU_GAP in word
-    rates = {tuple(sample.gyro_rad_s) for sample in right}
-    assert len(rates) == 2
+    rates, forces = ({tuple(getattr(s, of)) for s in right} for of in ("gyro_rad_s", "accel_m_s2"))
+    assert (len(rates), len(forces)) == (2, 2)
     for sample in samples:
         assert tuple(sample.gyro_rad_s) in rates
-        assert (sample.accel_m_s2 == right[0].accel_m_s2).all()
+        assert tuple(sample.accel_m_s2) in forces
     assert (np.diff([sample.t_ns for sample in samples]) > 0).all()
 
 
@@ -231,7 +238,9 @@ def test_a_restarted_board_gets_a_new_clock_at_once(config: SerialConfig, board:
 
 
 def frame(sequence: int, t_us: int) -> protocol.RawSample:
-    return protocol.RawSample(sequence, t_us, protocol.Status(0), (0, 0, 0), (sequence % 2, 0, 0), (0, 0, 0), 0)
+    return protocol.RawSample(
+        sequence, t_us, protocol.Status(0), (sequence % 2, 0, 256), (sequence % 2, 0, 0), (0, 0, 0), 0
+    )
 
 
 @pytest.mark.parametrize("up_us", [20_000_000, 3_000_000_000])
@@ -291,7 +300,7 @@ class ReadBoard:
 def read_board(monkeypatch: pytest.MonkeyPatch) -> ReadBoard:
     board = ReadBoard()
     monkeypatch.setattr("serial.Serial", lambda *_, **__: board)
-    monkeypatch.setattr("vislam.hw.bridge.bridge.received", board.received)
+    monkeypatch.setattr("vislam.hw.serial_port.received", board.received)
     monkeypatch.setattr("vislam.hw.bridge.bridge.time", SimpleNamespace(monotonic_ns=lambda: board.now_ns))
     return board
 
@@ -395,37 +404,32 @@ def test_a_chip_that_goes_away_and_comes_back(config: SerialConfig, board: Bridg
     bridge.close()
 
 
-def test_a_magnetometer_that_gives_the_same_for_ever_is_named_and_not_used(
-    config: SerialConfig, board: BridgeEmulator
+@pytest.mark.parametrize(
+    ("name", "fault", "kind", "value", "most"),
+    [
+        ("gyro", LineFaults(frozen=True), ImuSample, (1, 2, 3), 20),
+        ("accel", LineFaults(frozen_accel=True), ImuSample, (1, 2, 250), 20),
+        ("mag", LineFaults(frozen_mag=True), MagSample, (200, -400, 8), 10),
+    ],
+)
+def test_a_sensor_that_hangs_is_a_fault_and_not_used(
+    config: SerialConfig, board: BridgeEmulator, name: str, fault: LineFaults, kind: Any, value: Any, most: int
 ) -> None:
+    hello, bit = bridged("GY-85").hello, Health[f"{name.upper()}_FAULT"]
+    unit = {"gyro": hello.gyro_nrad_s * 1e-9, "accel": hello.accel_nm_s2 * 1e-9, "mag": hello.mag_pt * 1e-6}[name]
+    field = {"gyro": "gyro_rad_s", "accel": "accel_m_s2", "mag": "field_ut"}[name]
     bridge = SerialBridge(config)
-    collect(bridge, lambda found: any(isinstance(sample, MagSample) for sample in found))
-    assert Health.MAG_FAULT not in bridge.health()
-    board.faults = LineFaults(frozen_mag=True)
-    collect(bridge, lambda _: bridge.counters().get("mag_stuck", 0) > 0)
-    samples = collect(bridge, lambda found: len(found) > 100)
-    assert Health.MAG_FAULT in bridge.health()
-    assert not any(isinstance(sample, MagSample) for sample in samples)
-    board.faults = LineFaults()
-    collect(bridge, lambda found: any(isinstance(sample, MagSample) for sample in found))
-    assert Health.MAG_FAULT not in bridge.health()
-    bridge.close()
-
-
-def test_a_chip_that_hangs_is_a_fault(config: SerialConfig, board: BridgeEmulator) -> None:
-    bridge = SerialBridge(config)
-    collect(bridge, lambda found: len(imu(found)) > 200)
+    collect(bridge, lambda found: len(imu(found)) > 200 and any(isinstance(sample, MagSample) for sample in found))
     assert bridge.health() & (Health.GYRO_FAULT | Health.ACCEL_FAULT | Health.MAG_FAULT | Health.BUS_FAULT) == 0
-    board.faults = LineFaults(frozen=True)
-    samples = imu(collect(bridge, lambda _: bridge.counters().get("gyro_stuck", 0) > 10))
-    held = [
-        s for s in samples if np.allclose(s.gyro_rad_s, np.array([1, 2, 3]) * bridged("GY-85").hello.gyro_nrad_s * 1e-9)
-    ]
-    assert len(held) == 20, "50 ms of what is no motion"
-    assert Health.GYRO_FAULT | Health.IMU_GAP in bridge.health()
+    board.faults = fault
+    samples = collect(bridge, lambda _: bridge.counters().get(f"{name}_stuck", 0) > 10)
+    given = [s for s in samples if isinstance(s, kind) and np.allclose(getattr(s, field), np.array(value) * unit)]
+    assert len(given) == most, "of gyro and accelerometer 50 ms of what is no motion, of the field 0.2 s"
+    assert bit in bridge.health()
     board.faults = LineFaults()
-    collect(bridge, lambda found: len(imu(found)) > 10)
-    assert Health.GYRO_FAULT not in bridge.health()
+    collect(bridge, lambda found: sum(isinstance(sample, kind) for sample in found) > 10)
+    bridge.health()
+    assert bit not in bridge.health()
     bridge.close()
 
 
@@ -507,7 +511,7 @@ def test_a_file_is_no_port(config: SerialConfig) -> None:
 
 
 def test_a_port_without_permission_says_which_group(config: SerialConfig) -> None:
-    assert "dialout" in why_not_open(config, OSError(errno.EACCES, "Permission denied"))
+    assert "dialout" in why_not_open(config.port, config.baud, OSError(errno.EACCES, "Permission denied"))
 
 
 def test_without_pyserial_it_says_what_to_install(config: SerialConfig, monkeypatch: pytest.MonkeyPatch) -> None:

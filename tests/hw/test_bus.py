@@ -90,7 +90,7 @@ def test_errors_have_a_kind_are_counted_and_end_with_exit_code_5(smbus_only: boo
 
 def test_the_limit_of_a_transfer_reaches_the_kernel() -> None:
     clock = SteppedClock()
-    with emulated_bus(memory_bus(clock=clock)) as virtual:
+    with emulated_bus(memory_bus(stepped=clock)) as virtual:
         bus = I2cBus(virtual.path, 0.02)
         virtual.is_stuck = True
         begin_ns = clock.now_ns()
@@ -102,7 +102,7 @@ def test_the_limit_of_a_transfer_reaches_the_kernel() -> None:
 @pytest.mark.parametrize("bus_hz", [100e3, 400e3])
 def test_the_speed_of_the_bus_is_measured(bus_hz: float) -> None:
     clock = SteppedClock()
-    with emulated_bus(memory_bus(clock=clock, bus_hz=bus_hz)) as virtual:
+    with emulated_bus(memory_bus(stepped=clock, bus_hz=bus_hz)) as virtual:
         assert I2cBus(virtual.path, 0.02).measure_hz(0x50, 0, clock) == pytest.approx(bus_hz, rel=1e-3)
 
 

@@ -8,7 +8,7 @@ from vislam.hw.chips.adxl345 import Adxl345, self_test_limits_lsb
 from vislam.hw.chips.bus import I2cBus, SettingsLostError
 from vislam.hw.chips.hmc5883l import Hmc5883l
 from vislam.hw.chips.itg3205 import Itg3205
-from vislam.hw.chips.magnetometer import find_magnetometer
+from vislam.hw.chips.known import find_magnetometer
 from vislam.hw.emulator import (
     EmulatedBus,
     SensorError,
@@ -202,25 +202,6 @@ def test_no_magnetometer_or_a_stranger_at_its_address_is_none(clock: SteppedCloc
         assert bus.counters.total() == 0
 
 
-@pytest.mark.parametrize("name", ["HMC5883L", "QMC5883L", "QMC5883P"])
-def test_a_field_beyond_the_range_is_told(clock: SteppedClock, name: str) -> None:
-    def strong(t_ns: int):  # type: ignore[no-untyped-def]
-        return (0, 0, 0), (0, 0, 9.8), (0.0, 320.0, 0.0), 20.0
-
-    address, virtual = magnetometers(clock, SensorError(), strong)[name]
-    with emulated_bus(EmulatedBus({address: virtual})) as bus:  # type: ignore[dict-item]
-        chip = find_magnetometer(I2cBus(bus.path, 0.02), 1.9)
-        assert chip is not None
-        chip.configure(clock)
-        seen = []
-        for _ in range(10):
-            pass_time(clock, 0.02)
-            seen.append(chip.read())
-        readings = [r for r in seen if r is not None]
-        assert readings
-        assert all(r.overflow for r in readings)
-
-
 def test_hmc5883l_drops_the_measurement_that_still_has_the_old_gain(clock: SteppedClock) -> None:
     virtual = VirtualHmc5883l(still, clock.now_ns)
     with emulated_bus(EmulatedBus({0x1E: virtual})) as bus:
@@ -268,17 +249,3 @@ def test_hmc5883l_is_freed_after_a_lock(clock: SteppedClock) -> None:
                 virtual.lock()
             readings.append(chip.read())
         assert [k for k, r in enumerate(readings) if r is None] == [0, 10]
-
-
-@pytest.mark.parametrize("name", ["HMC5883L", "QMC5883L", "QMC5883P"])
-def test_magnetometers_that_lost_their_power_are_seen_at_the_next_read(clock: SteppedClock, name: str) -> None:
-    address, virtual = magnetometers(clock, SensorError())[name]
-    with emulated_bus(EmulatedBus({address: virtual})) as bus:  # type: ignore[dict-item]
-        chip = find_magnetometer(I2cBus(bus.path, 0.02), 1.9)
-        assert chip is not None
-        chip.configure(clock)
-        pass_time(clock, 0.05)
-        chip.read()
-        virtual.power_cycle()  # type: ignore[attr-defined]
-        with pytest.raises(SettingsLostError):
-            chip.read()

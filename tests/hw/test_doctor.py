@@ -3,6 +3,7 @@
 import json
 import os
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.hw.doctor import HardwareReport, Wanted, examine
-from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualAdxl345, emulated_bus, emulated_gy85
+from vislam.hw.emulator import EmulatedBus, SteppedClock, VirtualAdxl345, emulated_board, emulated_bus, emulated_gy85
 from worlds.capture import FakeCapture
 from worlds.gy85 import driving, still
 
@@ -74,20 +75,22 @@ def test_a_chip_at_its_other_address_and_a_stranger(tmp_path: Path) -> None:
     assert any(f"unknown chip ({words}" in d.name for d in report.devices)
 
 
-def test_a_chip_that_the_kernel_owns(tmp_path: Path) -> None:
-    device = tmp_path / "sys/bus/i2c/devices/7-0053"
-    driver = tmp_path / "sys/bus/i2c/drivers/adxl345_i2c"
+@pytest.mark.parametrize(("make", "address"), [(emulated_gy85, "0053"), (partial(emulated_board, "LSM6DSOX"), "006a")])
+def test_a_chip_that_the_kernel_owns_is_left_alone(make: Any, address: str, tmp_path: Path) -> None:
+    device = tmp_path / f"sys/bus/i2c/devices/7-{address}"
+    driver = tmp_path / "sys/bus/i2c/drivers/its_driver"
     device.mkdir(parents=True)
     driver.mkdir(parents=True)
     (device / "driver").symlink_to(driver)
-    report = examined(*board(path="/dev/i2c-7"), root=tmp_path)
-    assert "echo 7-0053 | sudo tee /sys/bus/i2c/drivers/adxl345_i2c/unbind" in said(report, "error")
+    clock = SteppedClock()
+    report = examined(make(still, clock.now_ns, path="/dev/i2c-7", stepped=clock), clock, root=tmp_path)
+    assert f"echo 7-{address} | sudo tee /sys/bus/i2c/drivers/its_driver/unbind" in said(report, "error")
 
 
 def test_a_slow_bus_gets_the_line_for_the_boot_file(tmp_path: Path) -> None:
     clock = SteppedClock()
     bus = emulated_gy85(still, clock.now_ns, stepped=clock)
-    slow = EmulatedBus(bus.chips, bus.path, clock=clock, bus_hz=100_000.0)
+    slow = EmulatedBus(bus.chips, bus.path, stepped=clock, bus_hz=100_000.0)
     text = said(examined(slow, clock, root=tmp_path), "warning")
     assert "the bus runs at 100 kHz" in text
     assert "i2c_arm_baudrate=400000" in text

@@ -15,12 +15,12 @@ from vislam.config import BoardConfig, Config, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.hw.board_check import check_board
 from vislam.hw.chips import BusError, I2cBus, identify
-from vislam.hw.chips.imus import KNOWN_IMUS
+from vislam.hw.chips.known import KNOWN_IMUS
 from vislam.hw.chips.mpu6050 import Mpu6050
 from vislam.hw.doctor import HardwareReport, Wanted, _listen, examine
 from vislam.hw.emulator import EmulatedBus, SensorError, SteppedClock, VirtualMpu6050, emulated_board, emulated_bus
+from vislam.hw.emulator.board import _KINDS
 from vislam.hw.emulator.bridge import BridgeEmulator, at_rest
-from vislam.hw.emulator.fifo_board import _KINDS
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.health import Health
 from vislam.hw.sensors import CHIPS, INERTIAL_KINDS, check_devices, open_inertial, rate_of, with_raw_samples
@@ -115,15 +115,6 @@ def test_a_board_that_moves_is_not_approved_of(tmp_path: Path) -> None:
     assert "10 allowed" in said(examined("LSM6DSOX", tmp_path, turning), "warning")
 
 
-def test_a_chip_that_the_kernel_owns_is_left_alone(tmp_path: Path) -> None:
-    device, driver = tmp_path / "sys/bus/i2c/devices/7-006a", tmp_path / "sys/bus/i2c/drivers/st_lsm6dsx_i2c"
-    device.mkdir(parents=True)
-    driver.mkdir(parents=True)
-    (device / "driver").symlink_to(driver)
-    report = examined("LSM6DSOX", tmp_path, path="/dev/i2c-7")
-    assert "echo 7-006a | sudo tee /sys/bus/i2c/drivers/st_lsm6dsx_i2c/unbind" in said(report, "error")
-
-
 def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(_KINDS, "MPU-6050", (VirtualMpu6050, 0x98, 0x68, 0.005, 400.0))
     path = "/dev/i2c-emulated"
@@ -147,8 +138,9 @@ def test_a_clone_is_stated_and_measured_as_asked(tmp_path: Path, monkeypatch: py
 )
 def test_a_gyroscope_of_half_the_scale_is_a_fault(who_am_i: int, named: str, lsb: str) -> None:
     clock = SteppedClock()
-    half = SensorError(scale=(0.5, 0.5, 0.5), density=(2e-4, 2e-4, 2e-4))  # without noise it would be a hung one
-    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, who_am_i=who_am_i)}, clock=clock)
+    noise = SensorError(density=(4e-3, 4e-3, 4e-3))  # without noise a sensor would be a hung one
+    half = SensorError(scale=(0.5, 0.5, 0.5), density=(2e-4, 2e-4, 2e-4))
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, half, noise, who_am_i=who_am_i)}, stepped=clock)
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:
         findings = check_board(board, *_listen(board, 0.3, clock), bus.path)
         assert board.health() == Health.GYRO_FAULT | Health.ACCEL_FAULT, "nothing else comes of the test"
@@ -182,7 +174,7 @@ def test_a_clone_is_tested_again_where_a_wire_was_disturbed(monkeypatch: pytest.
 
     monkeypatch.setattr(Mpu6050, "self_test", disturbed)
     clock = SteppedClock()
-    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, who_am_i=0x98)}, clock=clock)
+    bus = EmulatedBus({0x68: VirtualMpu6050(still, clock.now_ns, who_am_i=0x98)}, stepped=clock)
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named="mpu6050-clone")) as board:
         assert ["gravity" in test.what for test in board.self_tests] == [True, False]
 
@@ -218,7 +210,8 @@ def test_an_lsm6dso32_is_told_by_gravity_or_asked_for(named: str) -> None:
     clock = SteppedClock()
 
     def turning(t_ns: int):  # type: ignore[no-untyped-def]
-        return driving(t_ns)[0], *still(t_ns)[1:]  # without noise a gyro at rest is a hung chip
+        force = (0.01 * np.sin(t_ns * 1e-8), 0.0, 9.80665)  # without noise a sensor at rest is a hung chip
+        return driving(t_ns)[0], force, *still(t_ns)[2:]
 
     bus = emulated_board("LSM6DSO32", turning, clock.now_ns, stepped=clock, seed=2, grade="exact", magnetometer="none")
     with emulated_bus(bus), closing(FifoBoard(BoardConfig(bus=bus.path), clock, named=named)) as board:

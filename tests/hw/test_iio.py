@@ -94,17 +94,37 @@ def test_one_device_with_both_is_set_up_and_read_with_the_kernel_s_stamps(tmp_pa
     assert source.rate_hz == 200.0
     begin = time.monotonic_ns()
     for k in range(50):
-        device.push(begin + k * PERIOD_NS, 100, -200, 8192, k, -k, 2 * k)
+        device.push(begin + k * PERIOD_NS, 100 + k, -200, 8192, k, -k, 2 * k)
     samples = read_all(source, 50)
     assert [s.t_ns for s in samples] == [begin + k * PERIOD_NS for k in range(50)]
     np.testing.assert_allclose(samples[7].gyro_rad_s, GYRO_SCALE * np.array([7, -7, 14]))
-    np.testing.assert_allclose(samples[7].accel_m_s2, ACCEL_SCALE * np.array([100, -200, 8192]))
+    np.testing.assert_allclose(samples[7].accel_m_s2, ACCEL_SCALE * np.array([107, -200, 8192]))
     assert source.health() == Health(0)
     assert source.counters() == {}
     assert "kernel" in source.stamped_by
     source.close()
     source.close()
     assert device.said("buffer/enable") == "0"
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_a_sensor_that_hangs_alone_is_named_and_not_integrated(tmp_path: Path, sensor: str) -> None:
+    device = Device(tmp_path, 0, "mpu6050", ("accel", "anglvel"))
+    source = IioImu(config(silent_s=60.0), root=tmp_path)
+    begin = time.monotonic_ns() - 150 * PERIOD_NS
+    for k in range(130):
+        accel, gyro = (k, 0) if sensor == "gyro" else (0, k)
+        device.push(begin + k * PERIOD_NS, accel, 0, 8192, gyro, 0, 1)
+    samples = []
+    while source.counters().get(f"{sensor}_stuck", 0) < 10:
+        samples += source.read(0.02)
+    assert len(samples) == 20
+    assert source.health() == Health[f"{sensor.upper()}_FAULT"] | Health.IMU_GAP
+    device.push(time.monotonic_ns(), 131, 0, 8192, 131, 0, 1)
+    assert len(read_all(source, 1)) == 1
+    assert source.health() == Health(0)
+    source.close()
+    os.close(device.fd)
 
 
 def test_two_devices_are_joined_at_the_gyro_s_stamps(tmp_path: Path) -> None:

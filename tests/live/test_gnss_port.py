@@ -17,7 +17,8 @@ import pytest
 from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
 from vislam.hw import PortReadings, reading_port, talks
-from vislam.hw.reading_port import ReadingPort, check_port
+from vislam.hw.reading_port import ReadingPort
+from vislam.hw.serial_port import check_port
 from vislam.hw.talks import NmeaStream, UbxStream
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.toml import SensorPort
@@ -155,7 +156,7 @@ def test_a_mute_port_is_told_and_opened_anew(config: SensorPort, monkeypatch: py
 
 def test_a_port_that_is_not_there_is_refused_before_a_run(config: SensorPort) -> None:
     with pytest.raises(HardwareError, match="there is no port"):
-        check_port(config)
+        check_port(config.port, config.baud)
 
 
 def test_a_fix_is_stamped_when_the_first_byte_of_its_burst_came() -> None:

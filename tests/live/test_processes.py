@@ -20,7 +20,7 @@ from vislam.core.errors import HardwareError, TrackingLostError, UsageError, Vis
 from vislam.core.log import log_to
 from vislam.hw.chips import BusError
 from vislam.hw.health import Health
-from vislam.hw.source import InertialSource
+from vislam.hw.imu_source import InertialSource
 from vislam.live import run_live
 from vislam.live.processes import child
 from vislam.live.replay import Outages, ReplaySource

@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from vislam.config import BoardConfig
+from vislam.config import BoardConfig, Gy85Config
 from vislam.core.messages import Array, ImuSample
 from vislam.hw.emulator import EmulatedBus, FifoChip, SteppedClock, Truth, emulated_board, emulated_bus
 from vislam.hw.fifo_board import FifoBoard
-from worlds.gy85 import driving
+from vislam.hw.gy85 import Gy85
+from worlds.gy85 import board, driving, errors
 
 FIRMWARE = Path(__file__).with_name("bmi270_stand_in.c")  # what any virtual BMI270 is content with
+GY85 = "GY-85"
 KINDS = ("LSM6DSOX", "ISM330DHCX", "MPU-6050", "MPU-9250", "ICM-20948", "BMI270")
 
 
@@ -39,6 +41,30 @@ def fifo_board(
             yield driver, bus, clock
         finally:
             driver.close()
+
+
+@contextmanager
+def any_board(kind: str, **options: Any) -> Iterator[tuple[FifoBoard | Gy85, EmulatedBus, SteppedClock]]:
+    """Yield a driver on a virtual GY-85, or on a board of a kind with a FIFO."""
+    made = board(**options) if kind == GY85 else fifo_board(kind, **options)
+    with made as parts:
+        yield parts
+
+
+def again(driver: FifoBoard | Gy85, bus: EmulatedBus, clock: SteppedClock) -> FifoBoard | Gy85:
+    """Return a second driver of a board, which may not be there yet."""
+    if isinstance(driver, Gy85):
+        return Gy85(Gy85Config(bus=bus.path, self_test=False), clock, must_be_there=False)
+    return FifoBoard(BoardConfig(bus=bus.path, firmware=str(FIRMWARE)), clock, must_be_there=False)
+
+
+def assert_right(samples: list[ImuSample], kind: str) -> None:
+    """No sample may be wrong, however few there are: 0.3 deg/s and 0.03 m/s^2 of bias, noise, and 1 ms of stamps."""
+    assert samples
+    gyro, accel = errors(samples)
+    assert abs(gyro).max() < (0.06 if kind == GY85 else 0.04)
+    assert abs(accel).max() < (0.6 if kind == GY85 else 0.3)
+    assert (np.diff([s.t_ns for s in samples]) > 0).all()
 
 
 class Stalled(SteppedClock):

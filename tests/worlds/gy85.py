@@ -12,7 +12,7 @@ from vislam.config import Gy85Config
 from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.emulator import EmulatedBus, SteppedClock, Truth, emulated_bus, emulated_gy85
 from vislam.hw.gy85 import Gy85
-from vislam.hw.source import InertialSource
+from vislam.hw.imu_source import InertialSource
 
 FIELD_UT = np.array([20.0, -5.0, -42.0])
 
@@ -20,8 +20,12 @@ FIELD_UT = np.array([20.0, -5.0, -42.0])
 def driving(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:
     """A cart that turns and shakes a little: smooth, known at every time."""
     s = t_ns * 1e-9
-    rate = (0.1 * math.sin(3.0 * s), 0.2 * math.sin(2.0 * s), 0.5 + 0.4 * math.sin(s))  # never all level at once
-    force = (0.6 * math.sin(5.0 * s), 0.3 * math.cos(4.0 * s), 9.80665 + 0.2 * math.sin(7.0 * s))
+    rate = (
+        0.1 * math.sin(3.0 * s),
+        0.2 * math.sin(2.0 * s),
+        0.5 + 0.4 * math.sin(s),
+    )  # never all level at once
+    force = (0.6 * math.sin(5.0 * s), 0.6 * math.cos(5.0 * s), 9.80665 + 0.2 * math.sin(7.0 * s))
     return rate, force, tuple(FIELD_UT), 30.0
 
 

@@ -1,21 +1,18 @@
 """Any object of an `adafruit_*` driver that has `acceleration` and `gyro` as a source of inertial samples."""
 
 import importlib
-from collections import Counter
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from typing import Any
 
-import numpy as np
-
 from vislam.config import BoardConfig
 from vislam.core.errors import HardwareError, UsageError, install_line
-from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.body_map import BodyMap, triple
-from vislam.hw.gyro_zero import GyroZero
+from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.health import Health
-from vislam.hw.timing import Clock, HostClock, read_in_rounds
+from vislam.hw.imu_source import InertialSource
+from vislam.hw.timing import Clock, read_in_rounds
 
 MAX_RATE_HZ = 200.0  # each sample costs such a driver two or three transfers and some hundred lines of Python
 BNO085 = "adafruit_bno08x.i2c.BNO08X_I2C"
@@ -24,8 +21,8 @@ _TEMPERATURE_S = 0.5  # between looks at the temperature
 _BNO_REPORTS = {"acceleration": 0x01, "gyro": 0x02, "magnetic": 0x03}  # calibrated ones, by the BNO08X data sheet
 
 
-class AdafruitImu:
-    """Satisfies `InertialSource` with a driver object's `acceleration` (m/s^2), `gyro` (rad/s) and `magnetic` (uT).
+class AdafruitImu(InertialSource):
+    """An `InertialSource` with a driver object's `acceleration` (m/s^2), `gyro` (rad/s) and `magnetic` (uT).
 
     Stamps are the host's, in the middle between asking for the first value and having the second: such drivers give
     no time, and so the stamps jitter as the machine does. Values that are the last ones again are no new sample: chips
@@ -59,53 +56,29 @@ class AdafruitImu:
         missing = [name for name in ("acceleration", "gyro") if not hasattr(type(device), name)]
         if missing:
             raise UsageError(f"{type(device).__name__} has no {' and no '.join(missing)}; it is no inertial sensor")
+        super().__init__(self._config.calibration, self._config.silent_s, self._config.max_temperature_change_c, clock)
         self._device, self._open_again = device, open_again
-        self._clock: Clock = HostClock() if clock is None else clock
         self.rate_hz = self._config.rate_hz
-        self._map = BodyMap(self._config)
-        self._counts: Counter[str] = Counter()
-        self._events = Health(0)
-        self._last: Array = np.full(6, np.nan)
+        self._last: tuple[list[float], ...] = ()
         self._last_ns = self._next_mag_ns = self._next_temperature_ns = 0
         self._vain_ns: int | None = None  # since when it is asked and gives nothing new
         self._has_mag = self._config.mag is not False and hasattr(type(device), "magnetic")
         try:
-            triple(device.acceleration)
-            triple(device.gyro)
+            _triple(device.acceleration)
+            _triple(device.gyro)
         except Exception as error:  # a driver may raise anything
             raise HardwareError(
                 f"{type(device).__name__} cannot be read: {error}; check power and wires, `vislam doctor` lists buses"
             ) from error
         if self._has_mag and self._config.mag is None:
-            self._has_mag = self._field() is not None
-        now = self._clock.now_ns()
-        self._next_ns = self._last_out_ns = self._retry_ns = now
-        self._counts.clear()
-        self._events = Health(0)
-
-    @property
-    def temperature_c(self) -> float | None:
-        """Temperature by the driver; None where it has none."""
-        return self._map.temperature_c
-
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Take the drift from a temperature on off; see `InertialSource`."""
-        self._map.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
+            self._has_mag = self._read_field() is not None
+        self._next_ns = self._last_out_ns = self._retry_ns = self._clock.now_ns()
+        self._faults.counts.clear()
+        self._faults.taken()
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
         return read_in_rounds(self._clock, timeout_s, lambda: self._next_ns, self._poll)
-
-    def health(self) -> Health:
-        """Return the sensor bits that hold now and the events since the last call."""
-        word, self._events = self._events, Health(0)
-        if self._clock.now_ns() - self._last_out_ns > self._config.silent_s * _NS:
-            word |= Health.IMU_MISSING
-        return word | (Health.TEMPERATURE_DRIFT if self._map.is_far else Health(0))
-
-    def counters(self) -> dict[str, int]:
-        """Return how often each fault occurred since the start."""
-        return dict(self._counts)
 
     def close(self) -> None:
         """Let the object go; may be called twice."""
@@ -116,52 +89,51 @@ class AdafruitImu:
         samples: list[ImuSample | MagSample] = []
         asked = self._clock.now_ns()
         try:
-            rate = triple(self._device.gyro)
-            force = triple(self._device.acceleration)
+            values = rate, force = _triple(self._device.gyro), _triple(self._device.acceleration)
         except Exception as error:  # a driver may raise anything
             self._failed(error)
         else:
             answered = self._clock.now_ns()
             t_ns = (asked + answered) // 2
-            values = np.concatenate([rate, force])
-            if (values == self._last).all() or not force.any():  # zeros: a BNO085 before its first report
-                self._counts["repeated"] += 1
+            if values == self._last or not any(force):  # zeros: a BNO085 before its first report
+                self._faults.add("repeated")
             elif t_ns > self._last_ns:
-                self._last, self._last_ns, self._last_out_ns, self._vain_ns = values, t_ns, answered, None
-                samples.append(self._map.inertial(t_ns, rate, force))
+                self._last, self._last_ns, self._vain_ns = values, t_ns, None
+                if all([self._gyro.sound([rate])[0], self._accel.sound([force])[0]]):
+                    self._last_out_ns = answered
+                    samples.append(self._inertial(t_ns, rate, force))
         self._look(asked)
         if self._has_mag and asked >= self._next_mag_ns:
             self._next_mag_ns = asked + round(_NS / self._config.mag_rate_hz)
             begin = self._clock.now_ns()
-            field_ut = self._field()
-            if field_ut is not None and field_ut.any():  # zeros as above
-                samples.append(self._map.magnetic((begin + self._clock.now_ns()) // 2, field_ut))
+            field_ut = self._read_field()
+            if field_ut is not None and any(field_ut):  # zeros as above
+                samples += self._magnetic((begin + self._clock.now_ns()) // 2, field_ut)
         self._replace_silent(asked)
         period_ns = round(_NS / self.rate_hz)
         late = max(self._clock.now_ns() - self._next_ns, 0) // period_ns
         if late > 0:
-            self._counts["rounds_missed"] += late
-            self._events |= Health.IMU_GAP
+            self._faults.add("rounds_missed", Health.IMU_GAP, late)
         self._next_ns += (late + 1) * period_ns
         return samples
 
-    def _field(self) -> Array | None:
+    def _read_field(self) -> list[float] | None:
         try:
-            return triple(self._device.magnetic)
+            return _triple(self._device.magnetic)
         except Exception as error:  # also of a report that is not switched on
             self._failed(error)
-            self._events |= Health.MAG_FAULT
+            self._faults.events |= Health.MAG_FAULT
             return None
 
     def _look(self, now: int) -> None:
         if now >= self._next_temperature_ns and hasattr(type(self._device), "temperature"):
             self._next_temperature_ns = now + round(_TEMPERATURE_S * _NS)
             with suppress(Exception):
-                self._map.temperature_c = float(self._device.temperature)
+                self._warmed(float(self._device.temperature))
 
     def _failed(self, error: Exception) -> None:
-        self._counts["bad_values" if isinstance(error, ValueError | TypeError) else "read_failed"] += 1
-        self._events |= Health.BUS_FAULT | Health.IMU_GAP
+        name = "bad_values" if isinstance(error, ValueError | TypeError) else "read_failed"
+        self._faults.add(name, Health.BUS_FAULT | Health.IMU_GAP)
 
     def _replace_silent(self, asked: int) -> None:
         """Make a new object where the old one gives nothing, every `config.reopen_s`.
@@ -178,9 +150,17 @@ class AdafruitImu:
         try:
             self._device = self._open_again()
         except Exception:  # as above
-            self._counts["open_failures"] += 1
+            self._faults.add("open_failures")
         else:
-            self._counts["reopened"] += 1
+            self._faults.add("reopened")
+
+
+def _triple(values: Sequence[float]) -> list[float]:
+    """Return three finite numbers; raises ValueError or TypeError for anything else."""
+    found = [float(value) for value in values]
+    if len(found) != 3 or not all(map(math.isfinite, found)):
+        raise ValueError(f"three finite numbers are needed, got {values!r}")
+    return found
 
 
 def open_adafruit(name: str, config: BoardConfig) -> AdafruitImu:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,10 @@ class Affine:
 
     matrix: Array  # [3, 3]
     offset: Array  # [3]
+
+    def __call__(self, value: Any) -> Array:
+        """Return what a value [3] is in body axes."""
+        return self.matrix @ np.asarray(value, dtype=np.float64) + self.offset
 
     @staticmethod
     def of(axes: Axes, matrix: Matrix3, bias: Vector3, unit: float) -> Affine:

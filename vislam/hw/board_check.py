@@ -9,6 +9,7 @@ from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
 from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.own_imu import OwnImu
 
 Add = Callable[..., None]
@@ -31,16 +32,22 @@ _EXPLAINED = {
 }
 
 
-def check_board(
-    board: Gy85 | FifoBoard, inertial: list[ImuSample], magnetic: list[MagSample], where: str
-) -> list[Finding]:
-    """Return what the self-tests, the fault counters and some seconds of samples at rest say."""
+def _adding(where: str) -> tuple[list[Finding], Add]:
+    """Return a list of findings about a place, and what adds one of a severity, what it is and the next step."""
     findings: list[Finding] = []
 
     def add(severity: Severity, what: str, next_step: str = "") -> None:
         findings.append(Finding(severity, what, where, next_step))
 
-    for test in board.run_self_tests() if isinstance(board, FifoBoard) else board.self_tests:
+    return findings, add
+
+
+def check_board(
+    board: Gy85 | FifoBoard, inertial: list[ImuSample], magnetic: list[MagSample], where: str
+) -> list[Finding]:
+    """Return what the self-tests, the fault counters and some seconds of samples at rest say."""
+    findings, add = _adding(where)
+    for test in board.self_tests or board.run_self_tests():
         if test.passed is None:
             add("warning", f"{test.chip}: {test.what}", test.next_step)
         elif test.passed:
@@ -91,30 +98,27 @@ def _check_rest(inertial: list[ImuSample], max_rate_deg_s: float, add: Add) -> N
 
 def check_rest(inertial: list[ImuSample], where: str, max_rate_deg_s: float = MAX_RATE_DEG_S) -> list[Finding]:
     """Return what samples at rest say: gravity, the gyro's zero; nothing of less than 50 samples."""
-    findings: list[Finding] = []
-
-    def add(severity: Severity, what: str, next_step: str = "") -> None:
-        findings.append(Finding(severity, what, where, next_step))
-
+    findings, add = _adding(where)
     if len(inertial) >= _MIN_SAMPLES:
         _check_rest(inertial, max_rate_deg_s, add)
     return findings
 
 
-def check_stamps(source: object, where: str) -> list[Finding]:
+def check_stamps(source: InertialSource, where: str) -> list[Finding]:
     """Return where the stamps of an inertial source come from and, where that is known, how far they can be off."""
-    stamped_by = getattr(source, "stamped_by", None)
-    if stamped_by is None:
+    if not source.stamped_by:
         return []
     bound_ms = getattr(source, "stamp_bound_ms", None)
     bound = "" if bound_ms is None else f", known to about {bound_ms:.2f} ms"
-    findings = [Finding("ok", f"stamped by {stamped_by}{bound}", where, "")]
-    if isinstance(source, FifoBoard):
-        what = "this driver was tested against an emulator written from the data sheet and has not met a real chip"
-        findings.append(Finding("ok", what, where, "report what you see: docs/sensors.md"))
-    if isinstance(source, OwnImu):
-        what = "this driver was tested against a stand-in for its library and has not met a real device"
-        findings.append(Finding("ok", what, where, "report what you see: docs/sensors.md"))
+    findings, add = _adding(where)
+    add("ok", f"stamped by {source.stamped_by}{bound}")
+    for kind, stand_in, real in (
+        (FifoBoard, "an emulator written from the data sheet", "chip"),
+        (OwnImu, "a stand-in for its library", "device"),
+    ):
+        if isinstance(source, kind):
+            what = f"this driver was tested against {stand_in} and has not met a real {real}"
+            add("ok", what, "report what you see: docs/sensors.md")
     return findings
 
 

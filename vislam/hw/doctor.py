@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +21,7 @@ from vislam.hw.cameras.webcam import Capture, Webcam
 from vislam.hw.chips import IMU_NAMES, I2cBus, identify, kernel_driver, unbind_command, use_clone
 from vislam.hw.fifo_board import FifoBoard
 from vislam.hw.gy85 import Gy85
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.library_cameras import (
     WITH_IMU,
     gives_frames,
@@ -31,7 +33,7 @@ from vislam.hw.library_cameras import (
 )
 from vislam.hw.link import BUS_TIMEOUT_S
 from vislam.hw.sensors import open_inertial
-from vislam.hw.source import CapturedImage, InertialSource
+from vislam.hw.source import CapturedImage
 from vislam.hw.timing import Clock, HostClock
 
 _NS = 1_000_000_000
@@ -128,7 +130,7 @@ def examine(
         _examine_both(notes, wanted.imu, camera, seconds, clock, sensors)
         camera = None
     elif wanted.imu is not None:
-        _examine_named(notes, wanted.imu, seconds, clock, sensors)
+        _examine_imu(notes, wanted.imu, partial(open_inertial, wanted.imu, sensors), seconds, clock)
     else:
         _examine_buses(notes, wanted.i2c, seconds, clock, root, sensors)
     _examine_ports(notes, wanted.serial, seconds, clock, root, sensors)
@@ -160,12 +162,12 @@ def _examine_buses(
             notes.failed(error, path, severity)
             continue
         if make is not None:
-            _measure_board(notes, path, make, seconds, clock, severity)
+            _examine_imu(notes, path, make, seconds, clock, severity)
 
 
 def _examine_chips(
     notes: _Notes, bus: I2cBus, clock: Clock, root: Path, severity: Severity, sensors: SensorsConfig
-) -> Callable[[str, Clock], Gy85 | FifoBoard] | None:
+) -> Callable[[], Gy85 | FifoBoard] | None:
     """Note the chips of a bus; return what opens the board that they make up, if they are free."""
     notes.devices.append(Device("bus", bus.path, "I2C" if bus.is_combined else "SMBus only"))
     found: dict[str, int] = {}
@@ -189,14 +191,14 @@ def _examine_chips(
     imu = next((address for name, address in found.items() if name in IMU_NAMES), None)
     if imu is not None:
         _note_speed(notes, bus, imu, clock)
-        return lambda path, clock: FifoBoard(replace(sensors.board, bus=path), clock)
+        return lambda: FifoBoard(replace(sensors.board, bus=bus.path), clock)
     missing = [name for name in ("ITG3205", "ADXL345") if name not in found]
     if missing:
         what = f"no {' and no '.join(missing)} free to use"
         notes.add(severity, what, bus.path, "check power (3.3 V), ground, SDA and SCL; a GY-85 has both")
         return None
     _note_speed(notes, bus, 0x53, clock)
-    return lambda path, clock: Gy85(replace(sensors.gy85, bus=path), clock)
+    return lambda: Gy85(replace(sensors.gy85, bus=bus.path), clock)
 
 
 def _note_speed(notes: _Notes, bus: I2cBus, address: int, clock: Clock) -> None:
@@ -212,36 +214,22 @@ def _note_speed(notes: _Notes, bus: I2cBus, address: int, clock: Clock) -> None:
         notes.add("ok", f"the bus runs at {min(speed_hz, 1e6) / 1e3:.0f} kHz or more", bus.path)
 
 
-def _measure_board(
+def _examine_imu(
     notes: _Notes,
-    path: str,
-    make: Callable[[str, Clock], Gy85 | FifoBoard],
+    where: str,
+    make: Callable[[], InertialSource],
     seconds: float,
     clock: Clock,
-    severity: Severity,
+    severity: Severity = "error",
 ) -> None:
+    """Open an IMU and measure what comes."""
     try:
-        board = make(path, clock)
+        source = make()
     except HardwareError as error:
-        notes.failed(error, path, severity)
-        return
-    with closing(board):
-        inertial, magnetic = _listen(board, seconds, clock)
-        notes.findings += check_board(board, inertial, magnetic, path) + check_stamps(board, path)
-        _note_timing(notes, f"{path}: inertial", inertial, board.rate_hz, severity)
-        if magnetic:
-            notes.timings.append(_timing(f"{path}: magnetic", [sample.t_ns for sample in magnetic]))
-
-
-def _examine_named(notes: _Notes, name: str, seconds: float, clock: Clock, sensors: SensorsConfig) -> None:
-    """Open the IMU that a command line names and measure what comes."""
-    try:
-        source = open_inertial(name, sensors)
-    except HardwareError as error:
-        notes.failed(error, name, "error")
+        notes.failed(error, where, severity)
         return
     with closing(source):
-        _look_at_imu(notes, source, name, seconds, clock)
+        _look_at_imu(notes, source, where, seconds, clock, severity)
 
 
 def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: Clock, sensors: SensorsConfig) -> None:
@@ -256,7 +244,9 @@ def _examine_both(notes: _Notes, imu: str, camera: str, seconds: float, clock: C
         _look_at_camera(notes, images, seconds, clock)
 
 
-def _look_at_imu(notes: _Notes, source: InertialSource, name: str, seconds: float, clock: Clock) -> None:
+def _look_at_imu(
+    notes: _Notes, source: InertialSource, name: str, seconds: float, clock: Clock, severity: Severity = "error"
+) -> None:
     """Measure what an IMU gives, and note what it reports of itself."""
     inertial, magnetic = _listen(source, seconds, clock)
     if isinstance(source, SerialBridge):
@@ -266,12 +256,12 @@ def _look_at_imu(notes: _Notes, source: InertialSource, name: str, seconds: floa
         notes.findings += check_board(source, inertial, magnetic, name)
     else:
         notes.findings += check_rest(inertial, name, getattr(source, "max_zero_deg_s", MAX_RATE_DEG_S))
-    _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, "error")
+        if word := source.health():
+            what = f"health: {word.name}; {_counted(source.counters())}"
+            notes.add("warning", what, name, "see docs/sensors.md")
+    _note_timing(notes, f"{name}: inertial", inertial, source.rate_hz, severity)
     if magnetic:
         notes.timings.append(_timing(f"{name}: magnetic", [sample.t_ns for sample in magnetic]))
-    word = source.health()
-    if word:
-        notes.add("warning", f"health: {word.name}; {_counted(source.counters())}", name, "see docs/sensors.md")
 
 
 def _listen(source: InertialSource, seconds: float, clock: Clock) -> tuple[list[ImuSample], list[MagSample]]:
@@ -325,21 +315,8 @@ def _examine_ports(
         _check_permission(notes, path, "error" if path == wanted else "warning")
     if wanted is None:
         return
-    try:
-        bridge = SerialBridge(replace(sensors.serial, port=wanted))
-    except HardwareError as error:
-        notes.failed(error, wanted, "error")
-        return
-    with closing(bridge):
-        inertial, magnetic = _listen(bridge, seconds, clock)
-        notes.devices.append(Device("chips", wanted, bridge.board_name))
-        notes.findings += check_stamps(bridge, wanted) + check_rest(inertial, wanted, bridge.max_zero_deg_s)
-        _note_timing(notes, f"{wanted}: inertial", inertial, bridge.rate_hz, "error")
-        if magnetic:
-            notes.timings.append(_timing(f"{wanted}: magnetic", [sample.t_ns for sample in magnetic]))
-        word = bridge.health()
-        if word:
-            notes.add("warning", f"health: {word.name}; {_counted(bridge.counters())}", wanted, "see docs/sensors.md")
+    make = partial(SerialBridge, replace(sensors.serial, port=wanted))
+    _examine_imu(notes, wanted, make, seconds, clock)
 
 
 def _port_name(path: str) -> str:

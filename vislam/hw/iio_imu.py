@@ -1,19 +1,15 @@
 """An inertial chip that the kernel drives, through its Industrial I/O buffers: stamped by the kernel."""
 
 import time
-from collections import Counter
 from pathlib import Path
-
-import numpy as np
 
 from vislam.config import BoardConfig
 from vislam.core.errors import HardwareError
-from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.accel_at_gyro import AccelAtGyro
-from vislam.hw.body_map import BodyMap
-from vislam.hw.gyro_zero import GyroZero
 from vislam.hw.health import Health
 from vislam.hw.iio_device import KINDS, IioDevice, Scans, kinds_of
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.timing import wall_ahead_ns
 
 _NS = 1_000_000_000
@@ -22,12 +18,12 @@ _KEPT = 2000  # samples of one sensor that wait for the other: ten seconds at 20
 _FAR_NS = 2 * _NS  # a stamp so far from now is of another clock
 
 
-class IioImu:
-    """Satisfies `InertialSource` with one device of gyro and accelerometer, or with one of each.
+class IioImu(InertialSource):
+    """An `InertialSource` with one device of gyro and accelerometer, or with one of each.
 
     Stamps are the kernel's, taken at the chip's interrupt; `config.delay_s` is taken off (the kernel does not have the
     delay of a filter: None is none). Where gyro and accelerometer are devices of their own, the accelerometer is
-    interpolated to the gyro's stamps. One thread only.
+    interpolated to the gyro's stamps. None streams a temperature beside the samples. One thread only.
     """
 
     stamped_by = "the kernel, at the chip's interrupt"
@@ -43,31 +39,19 @@ class IioImu:
 
         Raises HardwareError: there is none, or it cannot be set up.
         """
+        super().__init__(config.calibration, config.silent_s, config.max_temperature_change_c)
         self._config, self._name, self._root = config, name, root
         self.rate_hz = config.rate_hz
-        self._map = BodyMap(config)
-        self._counts: Counter[str] = Counter()
-        self._events = Health(0)
         self._devices: list[IioDevice] = []
         self._pairs = AccelAtGyro(_KEPT)
         self._newest_ns: dict[str, int] = {}  # by device
         self._retry_ns = 0
-        self._last_out_ns = time.monotonic_ns()
         self._is_reopening = False
         try:
             self._open()
         except HardwareError:
             if must_be_there:
                 raise
-
-    @property
-    def temperature_c(self) -> float | None:
-        """None: no device of the kernel streams it beside the samples."""
-        return self._map.temperature_c
-
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """See `InertialSource`; without a temperature nothing is taken off."""
-        self._map.zero = GyroZero(temperature_c, np.asarray(gyro_per_c))
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
@@ -88,16 +72,7 @@ class IioImu:
 
     def health(self) -> Health:
         """Return the sensor bits that hold now and the events since the last call."""
-        word, self._events = self._events, Health(0)
-        if time.monotonic_ns() - self._last_out_ns > self._config.silent_s * _NS:
-            word |= Health.IMU_MISSING
-        if not self._devices:
-            word |= Health.GYRO_FAULT | Health.ACCEL_FAULT
-        return word | (Health.TEMPERATURE_DRIFT if self._map.is_far else Health(0))
-
-    def counters(self) -> dict[str, int]:
-        """Return how often each fault occurred since the start."""
-        return dict(self._counts)
+        return super().health() | (Health(0) if self._devices else Health.GYRO_FAULT | Health.ACCEL_FAULT)
 
     def close(self) -> None:
         """Stop the devices; may be called twice."""
@@ -113,8 +88,7 @@ class IioImu:
                 # one is waited for: the other's samples lie in the kernel's buffer meanwhile
                 self._take(device, device.read(timeout_s if k == 0 else 0.0))
             except OSError:
-                self._counts["gone"] += 1
-                self._events |= Health.BUS_FAULT | Health.IMU_GAP
+                self._faults.add("gone", Health.BUS_FAULT | Health.IMU_GAP)
                 self.close()
                 self._is_reopening = True
                 self._retry_ns = time.monotonic_ns() + round(self._config.reopen_s * _NS)
@@ -130,20 +104,25 @@ class IioImu:
         newest_ns = self._newest_ns.get(device.name, 0)
         for row, t_ns in enumerate((scans.t_ns - shift_ns).tolist()):
             if abs(t_ns - now) > _FAR_NS:
-                self._counts["stamps_far"] += 1
-                self._events |= Health.CLOCK_STEP
+                self._faults.add("stamps_far", Health.CLOCK_STEP)
             elif t_ns <= newest_ns:
-                self._counts["stamps_backwards"] += 1
+                self._faults.add("stamps_backwards")
             else:
                 newest_ns = t_ns
                 for kind, values in scans.values.items():
-                    (self._pairs.add_gyro if kind == "anglvel" else self._pairs.add_accel)(t_ns, values[row])
+                    watch = self._gyro if kind == "anglvel" else self._accel
+                    if not watch.sound([values[row].tolist()])[0]:
+                        self._pairs.clear()  # nothing is interpolated to what hangs, or across it
+                    elif watch is self._gyro:
+                        self._pairs.add_gyro(t_ns, values[row])
+                    else:
+                        self._pairs.add_accel(t_ns, values[row])
         self._newest_ns[device.name] = newest_ns
 
     def _merged(self) -> list[ImuSample]:
         """Return the gyro's samples around which the accelerometer has some, with those interpolated."""
         delay_ns = round((self._config.delay_s or 0.0) * _NS)
-        return [self._map.inertial(t_ns - delay_ns, rate, force) for t_ns, rate, force in self._pairs.merged()]
+        return [self._inertial(t_ns - delay_ns, rate, force) for t_ns, rate, force in self._pairs.merged()]
 
     # ---- coming and going -------------------------------------------------------------------------------------
 
@@ -154,9 +133,9 @@ class IioImu:
         try:
             self._open()
         except HardwareError:
-            self._counts["open_failures"] += 1
+            self._faults.add("open_failures")
         else:
-            self._counts["reopened"] += self._is_reopening
+            self._faults.add("reopened", times=int(self._is_reopening))
 
     def _open(self) -> None:
         devices: list[IioDevice] = []

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vislam.config import DepthCameraConfig, OakConfig, PicamConfig, RealsenseConfig, SensorsConfig
+from vislam.config import DepthCameraConfig, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 
 if TYPE_CHECKING:  # they load OpenCV, which the process that reads the IMU does without
@@ -49,7 +49,7 @@ def open_image_camera(name: str, config: SensorsConfig, must_be_there: bool = Tr
     from vislam.hw.cameras.library_camera import LibraryCamera
     from vislam.hw.cameras.picam import PicamStream, camera_number, picamera2
 
-    settings = _picam(name, config)
+    settings = _settings(name, config)
     picamera2()
     return LibraryCamera(f"picam:{camera_number(settings)}", lambda: PicamStream(settings), settings, must_be_there)
 
@@ -63,19 +63,17 @@ def open_frame_camera(
     """
     from vislam.hw.cameras.library_camera import LibraryCamera
 
-    with_depth, kind = has_depth(name), _kind(name)
+    with_depth, kind, settings = has_depth(name), _kind(name), _settings(name, config)
     shown = f"{kind},{_DEPTH}" if with_depth else kind
     if kind == "oak":
         from vislam.hw.cameras.oak import OakStream, depthai
 
-        oak = _oak(name, config)
         depthai()
-        return LibraryCamera(shown, lambda: OakStream(oak, with_depth, imu), oak, must_be_there)
+        return LibraryCamera(shown, lambda: OakStream(settings, with_depth, imu), settings, must_be_there)
     from vislam.hw.cameras.realsense import RealsenseStream, pyrealsense2
 
-    realsense = _realsense(name, config)
     pyrealsense2()
-    return LibraryCamera(shown, lambda: RealsenseStream(realsense, with_depth, imu), realsense, must_be_there)
+    return LibraryCamera(shown, lambda: RealsenseStream(settings, with_depth, imu), settings, must_be_there)
 
 
 def reads_own_imu(inertial: str, camera: str) -> bool:
@@ -122,16 +120,16 @@ def factory_rig(name: str, config: SensorsConfig, with_imu: bool = False) -> tup
 
     Raises HardwareError when it or its package is missing, DataError when its calibration cannot be used.
     """
-    with_depth, kind = has_depth(name), _kind(name)
+    with_depth, kind, settings = has_depth(name), _kind(name), _settings(name, config)
     if kind == "oak":
         from vislam.hw.cameras.oak import oak_rig
 
-        rig, is_known = oak_rig(_oak(name, config), with_depth, with_imu)
+        rig, is_known = oak_rig(settings, with_depth, with_imu)
     else:
         from vislam.hw.cameras.realsense import realsense_rig
 
-        rig, is_known = realsense_rig(_realsense(name, config), with_depth, with_imu), with_imu
-    if is_known or frame_config(name, config).position_m is not None:
+        rig, is_known = realsense_rig(settings, with_depth, with_imu), with_imu
+    if is_known or settings.position_m is not None:
         return rig, ()
     unknown = f", and {kind}.calibration with the axes of its IMU: it has no extrinsics in its memory" * with_imu
     return rig, (f"{kind}.position_m is not set{unknown}: the camera looks ahead from the IMU's place",)
@@ -139,7 +137,8 @@ def factory_rig(name: str, config: SensorsConfig, with_imu: bool = False) -> tup
 
 def frame_config(name: str, config: SensorsConfig) -> DepthCameraConfig:
     """Return the settings of a camera that gives frames, with what its name sets."""
-    return _oak(name, config) if _kind(name) == "oak" else _realsense(name, config)
+    found: DepthCameraConfig = _settings(name if _kind(name) in WITH_IMU else "realsense", config)
+    return found
 
 
 def check_library_camera(name: str, config: SensorsConfig) -> None:
@@ -147,14 +146,14 @@ def check_library_camera(name: str, config: SensorsConfig) -> None:
     if _kind(name) == "oak":
         from vislam.hw.cameras.oak import check_oak
 
-        check_oak(_oak(name, config))
+        check_oak(_settings(name, config))
         return
     if gives_frames(name):
         factory_rig(name, config)
         return
     from vislam.hw.cameras.picam import check_picam
 
-    check_picam(_picam(name, config))
+    check_picam(_settings(name, config))
 
 
 def _kind(name: str) -> str:
@@ -165,13 +164,7 @@ def _device(name: str) -> str:
     return name.partition(",")[0].partition(":")[2]
 
 
-def _picam(name: str, config: SensorsConfig) -> PicamConfig:
-    return replace(config.picam, device=_device(name) or config.picam.device)
-
-
-def _realsense(name: str, config: SensorsConfig) -> RealsenseConfig:
-    return replace(config.realsense, device=_device(name) or config.realsense.device)
-
-
-def _oak(name: str, config: SensorsConfig) -> OakConfig:
-    return replace(config.oak, device=_device(name) or config.oak.device)
+def _settings(name: str, config: SensorsConfig) -> Any:
+    """Return the settings of a camera's kind, with the device that its name gives."""
+    of_kind = getattr(config, _kind(name))
+    return replace(of_kind, device=_device(name) or of_kind.device)

@@ -1,6 +1,5 @@
 """How a board stands with its bus and its chips: which are up, what failed, what is set up again and when."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -8,29 +7,29 @@ from vislam.config import BoardConfig, Gy85Config
 from vislam.core.errors import HardwareError
 from vislam.hw.chips import BusError, I2cBus, SelfTest, SettingsLostError, kernel_driver, unbind_command
 from vislam.hw.health import Health
+from vislam.hw.imu_source import Faults
 from vislam.hw.timing import Clock
 
 _NACKS_TO_REOPEN = 5  # in a row until a chip counts as gone: single ones are noise on the wire
 BUS_TIMEOUT_S = 0.02  # of one transfer, in steps of 10 ms; the longest one takes 5 ms at 400 kHz
-# equal to the last bit in a row: noise at rest gives 10 at most in 40 minutes (LSM6DSOX at 2000 deg/s), a hung chip any
-# number; a gyro's samples are withheld from HELD on, a chip of STUCK ones is set up again
-HELD_SAMPLES, STUCK_SAMPLES = 20, 100
 START_ATTEMPTS = 3  # a wire may be disturbed just then
 
 
 @dataclass(slots=True, eq=False)
 class Link:
-    """How it stands with one chip: `start` finds it and sets it up, `fault` is its bit in the health word."""
+    """How it stands with one chip: `start` finds it and sets it up, `fault` is its bit in the health word.
+
+    `test` runs its self-test, and raises BusError where that broke off; it returns None where the chip has none.
+    """
 
     start: Callable[[I2cBus], None]
     fault: Health
+    test: Callable[[], SelfTest | None]
     is_inertial: bool = True  # the board is nothing without it
     is_wanted: bool = True
     retry_ns: int = 0
-    good_from_ns: int = 0
     newest_ns: int = 0  # when it last gave something new
     nacks: int = 0
-    repeats: int = 0  # equal samples in a row
     silent: int = 0  # reads in a row that found nothing new
     is_up: bool = False
     self_test: SelfTest | None = None
@@ -50,23 +49,15 @@ class Link:
         was_up = self.newest_ns != 0
         self.is_up, self.newest_ns = True, now_ns
         self.nacks = self.silent = 0
-        self.repeats = min(self.repeats, HELD_SAMPLES)  # until it gives another value
         return was_up
 
 
 class ChipLinks:
-    """Owns a board's bus: opens it and sets its chips up, again and again where they go away, and keeps count.
+    """Owns a board's bus: opens it and sets its chips up, again and again where they go away, and tests them."""
 
-    Attributes:
-        counts: how often each fault occurred since the start.
-        events: health bits of what happened since `health` last reported them.
-    """
-
-    def __init__(self, config: Gy85Config | BoardConfig, clock: Clock, links: tuple[Link, ...]) -> None:
+    def __init__(self, config: Gy85Config | BoardConfig, clock: Clock, faults: Faults, links: tuple[Link, ...]) -> None:
         """Take the board's settings and its chips, in the order in which they are set up; nothing is opened yet."""
-        self._config, self._clock, self._links = config, clock, links
-        self.counts: Counter[str] = Counter()
-        self.events = Health(0)
+        self._config, self._clock, self._faults, self._links = config, clock, faults, links
         self._bus: I2cBus | None = None
         self._retry_bus_ns = 0
 
@@ -76,8 +67,8 @@ class ChipLinks:
         return all(link.is_up for link in self._links if link.is_wanted)
 
     def health(self) -> Health:
-        """Return the bits of bus and chips that hold now and the events since the last call."""
-        word, self.events = self.events, Health(0)
+        """Return the bits of bus and chips that hold now."""
+        word = Health(0)
         for link in self._links:
             if link.is_wanted and link.is_bad:
                 word |= link.fault
@@ -119,7 +110,7 @@ class ChipLinks:
                 return None
             self._retry_bus_ns = now + reopen_ns
             try:
-                self._bus = I2cBus(self._config.bus, BUS_TIMEOUT_S, self.counts)
+                self._bus = I2cBus(self._config.bus, BUS_TIMEOUT_S, self._faults.counts)
             except BusError as error:
                 return error
         problem: HardwareError | None = None
@@ -131,28 +122,48 @@ class ChipLinks:
                 link.start(self._bus)
             except HardwareError as error:
                 problem = error if problem is None and link.is_inertial else problem
-                self.events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
+                self._faults.events |= Health.BUS_FAULT if isinstance(error, BusError) else Health(0)
                 continue
             if link.came_up(self._clock.now_ns()):
-                self.counts["reopened"] += 1
+                self._faults.add("reopened")
         if not any(link.is_up for link in self._links):
             self.close()  # an adapter that comes back has a new device file
         return problem
 
-    def hung(self, link: Link, counter: str, now_ns: int) -> None:
+    def tested(self) -> tuple[SelfTest, ...]:
+        """Run the self-tests of the chips that are up; one that breaks off is set up again, and tried again."""
+        found = []
+        for link in [link for link in self._links if link.is_up]:
+            for _ in range(START_ATTEMPTS):
+                self._clock.sleep_until(link.retry_ns if not link.is_up else 0)
+                self.connect(self._clock.now_ns())
+                if not link.is_up:
+                    continue
+                try:
+                    link.self_test = link.test()
+                except BusError as error:
+                    self.failed(link, error)
+                    link.drop(self._clock.now_ns())  # its stimulus may still be on
+                else:
+                    found += [] if link.self_test is None else [link.self_test]
+                    break
+        for link in self._links:
+            link.newest_ns = self._clock.now_ns()  # no sample was asked of them meanwhile
+        return tuple(found)
+
+    def hung(self, link: Link, fault: Health, now_ns: int) -> None:
         """Take note of a chip that answers and gives nothing new; it is set up again, which may be too soon to see."""
-        self.counts[counter] += 1
-        self.events |= link.fault
+        self._faults.events |= fault
         link.drop(now_ns)
 
     def failed(self, link: Link, error: BusError | SettingsLostError) -> None:
         """Take note of a failed transfer; the chip is given up after several, or at once if the wire is dead."""
         now = self._clock.now_ns()
         if isinstance(error, SettingsLostError):
-            self.counts["settings_lost"] += 1
+            self._faults.add("settings_lost")
             link.drop(now)
             return
-        self.events |= Health.BUS_FAULT
+        self._faults.events |= Health.BUS_FAULT
         link.nacks += 1
         if error.kind != "nack" or link.nacks >= _NACKS_TO_REOPEN:
             link.drop(now)

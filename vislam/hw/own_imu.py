@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 
 import numpy as np
 
@@ -11,14 +11,15 @@ from vislam.core.messages import Array, ImuSample, MagSample
 from vislam.hw.accel_at_gyro import AccelAtGyro
 from vislam.hw.affine import Affine
 from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 
 _NS = 1_000_000_000
 _KEPT = 4000  # samples that wait to be taken: 20 s at 200 Hz
 _GAP_PERIODS = 2.5  # between two samples of the gyro; beyond, some were lost
 
 
-class OwnImu:
-    """Satisfies `InertialSource`; any thread may put in, one takes out.
+class OwnImu(InertialSource):
+    """An `InertialSource`; any thread may put in, one takes out.
 
     Attributes:
         stamped_by: where the stamps come from, for a person.
@@ -27,20 +28,14 @@ class OwnImu:
 
     def __init__(self, name: str, config: DepthCameraConfig) -> None:
         """Nothing is opened here: the camera does that, and calls `begin`."""
+        super().__init__(config.calibration, config.imu_silent_s)
         self.path = name
         self.rate_hz = config.imu_rate_hz
         self.stamped_by, self.problem = "not known yet", ""
-        self._config = config
-        c = config.calibration
-        self._gyro_map = Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, 1.0)
-        self._accel_map = Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, 1.0)
         self._pairs = AccelAtGyro(_KEPT)
         self._samples: deque[ImuSample | MagSample] = deque()
         self._has_come = threading.Condition()
-        self._counts: Counter[str] = Counter()
-        self._events = Health(0)
         self._gyro_ns = self._accel_ns = 0
-        self._newest_ns = time.monotonic_ns()  # of arrival
         self._is_closed = False
 
     # ---- the device's side ------------------------------------------------------------------------------------
@@ -52,16 +47,15 @@ class OwnImu:
             R_body_imu: [3, 3] by its maker's extrinsics; None: by the axes of the settings.
             rate_hz: of the gyro.
         """
-        c = self._config.calibration
+        c = self._calibration
         with self._has_come:
             self.rate_hz = rate_hz
             if R_body_imu is not None:
-                self._gyro_map = _turned(R_body_imu, np.array(c.gyro_matrix), np.array(c.gyro_bias_rad_s))
-                self._accel_map = _turned(R_body_imu, np.array(c.accel_matrix), np.array(c.accel_bias_m_s2))
+                gyro = _turned(R_body_imu, np.array(c.gyro_matrix), np.array(c.gyro_bias_rad_s))
+                accel = _turned(R_body_imu, np.array(c.accel_matrix), np.array(c.accel_bias_m_s2))
+                self._maps = (gyro, accel, self._maps[2])
             self._pairs.clear()
-            if self._counts["opened"]:
-                self._events |= Health.IMU_GAP
-            self._counts["opened"] += 1
+            self._faults.add("opened", Health.IMU_GAP if self._faults.counts["opened"] else Health(0))
             self.problem = ""
 
     def add_gyro(self, t_ns: int, rate: Array) -> None:
@@ -70,11 +64,11 @@ class OwnImu:
             return
         with self._has_come:
             if self._gyro_ns and (t_ns - self._gyro_ns) * self.rate_hz > _GAP_PERIODS * _NS:
-                self._counts["gaps"] += 1
-                self._events |= Health.IMU_GAP
+                self._faults.add("gaps", Health.IMU_GAP)
             self._gyro_ns = t_ns
-            self._pairs.add_gyro(t_ns, rate)
-            self._merge()
+            if self._gyro.sound([rate.tolist()])[0]:
+                self._pairs.add_gyro(t_ns, rate)
+                self._merge()
 
     def add_accel(self, t_ns: int, force: Array) -> None:
         """Take a specific force [3], m/s^2 in the axes of the IMU."""
@@ -82,14 +76,16 @@ class OwnImu:
             return
         with self._has_come:
             self._accel_ns = t_ns
-            self._pairs.add_accel(t_ns, force)
-            self._merge()
+            if self._accel.sound([force.tolist()])[0]:
+                self._pairs.add_accel(t_ns, force)
+                self._merge()
+            else:
+                self._pairs.clear()
 
-    def count(self, what: str, event: Health | None = None) -> None:
+    def count(self, what: str, *events: Health) -> None:
         """Count a fault, with the bit that reports it."""
         with self._has_come:
-            self._counts[what] += 1
-            self._events |= Health(0) if event is None else event
+            self._faults.add(what, *events)
 
     def _is_sound(self, t_ns: int, before_ns: int, value: Array) -> bool:
         """Return whether a sample can be used; counts what cannot."""
@@ -105,29 +101,18 @@ class OwnImu:
         for t_ns, rate, force in self._pairs.merged():
             if len(self._samples) >= _KEPT:
                 self._samples.popleft()
-                self._counts["not_taken"] += 1
-                self._events |= Health.IMU_GAP
-            gyro, accel = self._gyro_map, self._accel_map
-            sample = ImuSample(t_ns, gyro.matrix @ rate + gyro.offset, accel.matrix @ force + accel.offset)
-            self._samples.append(sample)
-            self._counts["samples"] += 1
-            self._newest_ns = time.monotonic_ns()
+                self._faults.add("not_taken", Health.IMU_GAP)
+            self._samples.append(self._inertial(t_ns, rate, force))
+            self._faults.add("samples")
+            self._last_out_ns = time.monotonic_ns()
             self._has_come.notify_all()
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether a sample has come, waiting at most so long for the first one."""
         with self._has_come:
-            return self._has_come.wait_for(lambda: self._counts["samples"] > 0, timeout_s)
+            return self._has_come.wait_for(lambda: self._faults.counts["samples"] > 0, timeout_s)
 
     # ---- the reader's side ------------------------------------------------------------------------------------
-
-    @property
-    def temperature_c(self) -> float | None:
-        """None: it is not read."""
-        return None
-
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Do nothing: without a temperature nothing is taken off."""
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what came since the last call, waiting at most `timeout_s`; see `InertialSource`."""
@@ -140,14 +125,12 @@ class OwnImu:
     def health(self) -> Health:
         """Return the bits that hold now and the events since the last call."""
         with self._has_come:
-            word, self._events = self._events, Health(0)
-            is_silent = time.monotonic_ns() - self._newest_ns > self._config.imu_silent_s * _NS
-        return word | (Health.IMU_MISSING if is_silent else Health(0))
+            return super().health()
 
     def counters(self) -> dict[str, int]:
         """Return samples, and how often each fault occurred since the start."""
         with self._has_come:
-            return dict(self._counts)
+            return super().counters()
 
     def close(self) -> None:
         """Wake who waits; the camera gives the device back."""

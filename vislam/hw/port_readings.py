@@ -9,7 +9,7 @@ from vislam.core.readings import Reading
 from vislam.hw.bridge.passer import BridgeState, BytesAt, CountsAt, passed_on
 from vislam.hw.bridge.protocol import Chips
 from vislam.hw.reading_port import ReadingPort
-from vislam.hw.talks import CountTalk, FixTalk
+from vislam.hw.talks import CountTalk, FixTalk, Talk
 from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.toml import SensorPort
 
@@ -49,7 +49,8 @@ class PassedReadings:
                 found += [r for talk in self._fixes.values() for r in talk.feed(item.data, item.t_ns)]
             else:
                 self._state = item
-                self._begin()
+                for _, talk in self._talks():
+                    talk.begin()
         if self._heard_ns is not None and time.monotonic_ns() - self._heard_ns > _GAP_NS:
             self._heard_ns = None
             found += [reading for talk in self._fixes.values() for reading in talk.end_burst()]
@@ -58,8 +59,7 @@ class PassedReadings:
     def status(self) -> dict[str, str]:
         """Return by sensor "well", or the problem of the bridge, its sketch or the device at it."""
         asked = dict.fromkeys(self._counts, Chips.ENCODERS) | dict.fromkeys(self._fixes, Chips.GNSS)
-        talks: dict[str, CountTalk | FixTalk] = {**self._counts, **self._fixes}
-        return {name: self._state.problem or self._lack(chip) or talks[name].status() for name, chip in asked.items()}
+        return {name: self._state.problem or self._lack(asked[name]) or talk.status() for name, talk in self._talks()}
 
     def _lack(self, chip: Chips) -> str:
         chips = self._state.chips
@@ -69,22 +69,18 @@ class PassedReadings:
 
     def counters(self) -> dict[str, dict[str, int]]:
         """Return by sensor how many readings came, and how often each fault occurred."""
-        talks: dict[str, CountTalk | FixTalk] = {**self._counts, **self._fixes}
-        return {name: talk.counters() for name, talk in talks.items()}
+        return {name: talk.counters() for name, talk in self._talks()}
 
     def datums(self) -> dict[str, Geodetic]:
         """Return by receiver where its frame begins, as far as it has reported."""
-        return {name: datum for name, talk in self._fixes.items() if (datum := talk.datum) is not None}
+        return {name: datum for name, talk in self._talks() if (datum := talk.datum) is not None}
 
     def close(self) -> None:
         """Stop listening; may be called twice."""
         self._source.close()
 
-    def _begin(self) -> None:
-        for talk in self._counts.values():
-            talk.begin()
-        for receiver in self._fixes.values():
-            receiver.begin()
+    def _talks(self) -> list[tuple[str, Talk]]:
+        return [*self._counts.items(), *self._fixes.items()]
 
 
 class PortReadings:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vislam.config import BoardConfig, ImuChip, SensorCalibration, SensorsConfig
+from vislam.config import ImuChip, SensorCalibration, SensorsConfig
 from vislam.core.errors import HardwareError, UsageError
 from vislam.hw.library_cameras import (
     WITH_IMU,
@@ -26,7 +24,8 @@ if TYPE_CHECKING:
 
     from vislam.hw.cameras.library_camera import LibraryCamera
     from vislam.hw.cameras.video import VideoCamera
-    from vislam.hw.source import CapturedImage, InertialSource
+    from vislam.hw.imu_source import InertialSource
+    from vislam.hw.source import CapturedImage
 
 # chips with a FIFO as a command line names them, and the family of each as the settings do; board: whichever answers
 CHIPS: dict[str, ImuChip | None] = {
@@ -55,7 +54,8 @@ def open_inertial(
     if kind in CHIPS:
         from vislam.hw.fifo_board import FifoBoard
 
-        return FifoBoard(_board(kind, where, config), must_be_there=must_be_there, named=kind)
+        board = _placed(config.board, bus=where, chip=CHIPS[kind])
+        return FifoBoard(board, must_be_there=must_be_there, named=kind)
     if kind in ("bno085", "adafruit"):
         from vislam.hw.adafruit import BNO085, open_adafruit
 
@@ -67,13 +67,11 @@ def open_inertial(
     if kind == "gy85":
         from vislam.hw.gy85 import Gy85
 
-        board = replace(config.gy85, bus=where) if where else config.gy85
-        return Gy85(board, must_be_there=must_be_there)
+        return Gy85(_placed(config.gy85, bus=where), must_be_there=must_be_there)
     if kind == "serial":
         from vislam.hw.bridge.bridge import SerialBridge
 
-        bridge = replace(config.serial, port=where) if where else config.serial
-        return SerialBridge(bridge, must_be_there, further)
+        return SerialBridge(_placed(config.serial, port=where), must_be_there, further)
     reads_own_imu(name, "none")  # raises: its camera has to be opened with it
     raise UsageError(
         f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, with a place such as gy85:/dev/i2c-1, "
@@ -81,11 +79,9 @@ def open_inertial(
     )
 
 
-def _board(kind: str, where: str, config: SensorsConfig) -> BoardConfig:
-    """Return the settings of a board with what its name sets."""
-    board = replace(config.board, bus=where) if where else config.board
-    family = CHIPS[kind]
-    return board if family is None else replace(board, chip=family)
+def _placed(section: Any, **by_name: str | None) -> Any:
+    """Return the settings of a sensor with what its name sets."""
+    return replace(section, **{field: value for field, value in by_name.items() if value})
 
 
 def rate_of(name: str, config: SensorsConfig) -> float:
@@ -143,12 +139,9 @@ def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:
 
         find_devices(Path("/"), where)
     elif kind == "serial":
-        from vislam.hw.bridge.bridge import why_not_open
+        from vislam.hw.serial_port import check_port
 
-        bridge = replace(config.serial, port=where) if where else config.serial
-        if not os.access(bridge.port, os.R_OK | os.W_OK):  # opening it would reset the board
-            code = errno.EACCES if Path(bridge.port).exists() else errno.ENOENT
-            raise HardwareError(why_not_open(bridge, OSError(code, os.strerror(code))))
+        check_port(where or config.serial.port, config.serial.baud)
     if is_library_camera(camera):
         check_library_camera(camera, config)
     elif camera != "none" and not is_video(camera):

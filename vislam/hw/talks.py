@@ -9,7 +9,6 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -112,49 +111,34 @@ class UbxStream:
         return []
 
 
-class Talk(Protocol):
-    """Makes readings of what one device sends."""
+class Talk:
+    """Makes readings of what one device sends; counts them, and keeps why others were refused."""
 
-    datum: Geodetic | None  # where the frame of the readings begins; None: none, or not known yet
+    def __init__(self, noun: str, plural: str) -> None:
+        """Take what a reading is called."""
+        self._counts = {plural: 0, "refused": 0}
+        self._noun, self._plural, self._refusal = noun, plural, ""
+        self._newest_ns: int | None = None  # when the last good one came
+
+    @property
+    def datum(self) -> Geodetic | None:
+        """Where the frame of the readings begins; None: none, or not known yet."""
+        return None
 
     def begin(self) -> None:
-        """Forget what was half said: the device was plugged in again."""
-        ...
+        """Forget what was half said, and what it is counted from: the device was plugged in again."""
+        raise NotImplementedError
 
     def feed(self, data: bytes, arrival_ns: int) -> list[Reading]:
         """Return the readings that are complete with these bytes, which came at a time of CLOCK_MONOTONIC."""
-        ...
+        raise NotImplementedError
 
     def end_burst(self) -> list[Reading]:
         """Return the readings that are complete because nothing more came."""
-        ...
+        return []
 
     def status(self) -> str:
         """Return "well", or why there is no reading."""
-        ...
-
-    def counters(self) -> dict[str, int]:
-        """Return how many readings were good, and how often each fault occurred."""
-        ...
-
-
-class _Tally:
-    """How many readings there were, when the last one was good, and why another was refused."""
-
-    def __init__(self, noun: str, plural: str) -> None:
-        self.counts = {plural: 0, "refused": 0}
-        self._noun, self._plural, self._refusal = noun, plural, ""
-        self._newest_ns: int | None = None
-
-    def take(self) -> None:
-        self.counts[self._plural] += 1
-        self._refusal, self._newest_ns = "", time.monotonic_ns()
-
-    def refuse(self, why: str) -> None:
-        self.counts["refused"] += 1
-        self._refusal = why
-
-    def status(self) -> str:
         newest_ns = self._newest_ns
         silent_ns = 0 if newest_ns is None else time.monotonic_ns() - newest_ns
         if newest_ns is not None and silent_ns <= _OLD_NS:
@@ -162,9 +146,21 @@ class _Tally:
         since = f"no {self._noun} yet" if newest_ns is None else f"no {self._noun} for {silent_ns / _NS:.0f} s"
         return f"{since}: {self._refusal}" if self._refusal else since
 
+    def counters(self) -> dict[str, int]:
+        """Return how many readings were good, and how often each fault occurred."""
+        return dict(self._counts)
 
-class FixTalk:
-    """Satisfies `Talk`: a satellite receiver, by NMEA or UBX."""
+    def _take(self) -> None:
+        self._counts[self._plural] += 1
+        self._refusal, self._newest_ns = "", time.monotonic_ns()
+
+    def _refuse(self, why: str) -> None:
+        self._counts["refused"] += 1
+        self._refusal = why
+
+
+class FixTalk(Talk):
+    """A satellite receiver, by NMEA or UBX."""
 
     def __init__(self, name: str, config: SensorPort) -> None:
         """Begin with nothing said.
@@ -173,9 +169,9 @@ class FixTalk:
             name: of the sensor.
             config: of the receiver.
         """
+        super().__init__("fix", "fixes")
         self._config = config
         self._readings = FixReadings(name, config.gnss)  # its datum outlives a plug that was pulled
-        self._tally = _Tally("fix", "fixes")
         self._damaged = 0  # by streams before this one
         self._stream = self._new_stream()
 
@@ -198,13 +194,9 @@ class FixTalk:
         """See `Talk`."""
         return [reading for fix in self._stream.end_burst() for reading in self._made(fix)]
 
-    def status(self) -> str:
-        """See `Talk`."""
-        return self._tally.status()
-
     def counters(self) -> dict[str, int]:
         """See `Talk`."""
-        return {**self._tally.counts, "damaged": self._damaged + self._stream.damaged}
+        return {**self._counts, "damaged": self._damaged + self._stream.damaged}
 
     def _new_stream(self) -> NmeaStream | UbxStream:
         return UbxStream() if self._config.format == "ubx" else NmeaStream()
@@ -213,24 +205,24 @@ class FixTalk:
         try:
             reading = self._readings.reading(fix)
         except ValueError as error:
-            self._tally.refuse(str(error))
+            self._refuse(str(error))
             return
         if reading is not None:
-            self._tally.take()
+            self._take()
             yield replace(reading, t_ns=reading.t_ns - round(self._config.delay_s * _NS))
 
 
-class CountTalk:
+class CountTalk(Talk):
     """Readings of `wheels` from counts of two encoders."""
 
     def __init__(self, name: str, settings: TicksSettings) -> None:
         """Take the sensor's name, and how counts are made."""
+        super().__init__("reading", "readings")
         self._name, self._settings = name, settings
-        self._tally = _Tally("reading", "readings")
         self._speeds = TickSpeeds(settings)
 
     def begin(self) -> None:
-        """Forget the last counts: they may have begun again."""
+        """See `Talk`."""
         self._speeds = TickSpeeds(self._settings)
 
     def counted(self, t_ns: int, left: int, right: int) -> list[Reading]:
@@ -238,30 +230,20 @@ class CountTalk:
         try:
             found = self._speeds.speeds(t_ns, left, right)
         except ValueError as error:
-            self._tally.refuse(str(error))
+            self._refuse(str(error))
             return []
         if found is None:
             return []
-        self._tally.take()
+        self._take()
         return [Reading(self._name, found[0], np.array(found[1]))]
 
-    def status(self) -> str:
-        """Return "well", or why there is no reading."""
-        return self._tally.status()
 
-    def counters(self) -> dict[str, int]:
-        """Return how many readings there were, and how many counts gave none."""
-        return dict(self._tally.counts)
-
-
-class LineTalk:
-    """Satisfies `Talk`: lines of numbers, in the order of the columns of the sensor's kind or `left right` counts.
+class LineTalk(Talk):
+    """Lines of numbers, in the order of the columns of the sensor's kind or `left right` counts.
 
     A word before them is ignored. A number more than are asked is the device's clock in microseconds, 32 bits;
     without it a line has the time of its first byte. What begins with # is a remark.
     """
-
-    datum = None
 
     def __init__(self, name: str, config: SensorPort) -> None:
         """Begin with nothing said.
@@ -270,10 +252,10 @@ class LineTalk:
             name: of the sensor.
             config: of its port: `columns` and `ticks` say what stands in a line.
         """
+        super().__init__("reading", "readings")
         self._name, self._delay_ns = name, round(config.delay_s * _NS)
         self._columns = 2 if config.ticks else len(config.columns)
         self._count = CountTalk(name, config.ticks) if config.ticks else None
-        self._tally = _Tally("reading", "readings")
         self._faults = {"damaged": 0, "unstamped": 0}
         self._begun = False  # what comes before the first end of a line may be the rest of one
         self._rest, self._line_ns = b"", 0
@@ -303,18 +285,13 @@ class LineTalk:
                 self._faults["damaged"] += 1
         return found
 
-    def end_burst(self) -> list[Reading]:
-        """Return nothing: lines have ends; see `Talk`."""
-        return []
-
     def status(self) -> str:
         """See `Talk`."""
-        return (self._count or self._tally).status()
+        return super().status() if self._count is None else self._count.status()
 
     def counters(self) -> dict[str, int]:
         """See `Talk`."""
-        counts = self._tally.counts if self._count is None else self._count.counters()
-        return {**counts, **self._faults}
+        return {**(self._counts if self._count is None else self._count.counters()), **self._faults}
 
     def _line(self, line: bytes) -> list[Reading]:
         if line.startswith(b"#"):
@@ -338,10 +315,10 @@ class LineTalk:
             return []
         if self._count is not None:
             return self._count.counted(stamp_ns - self._delay_ns, int(numbers[0]), int(numbers[1]))
-        self._tally.take()
+        self._take()
         return [Reading(self._name, stamp_ns - self._delay_ns, np.array(numbers[: self._columns]))]
 
 
-def talk_of(name: str, config: SensorPort) -> FixTalk | LineTalk:
+def talk_of(name: str, config: SensorPort) -> Talk:
     """Return what makes readings of the bytes of a sensor's port."""
     return LineTalk(name, config) if config.format == "csv" else FixTalk(name, config)

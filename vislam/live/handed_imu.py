@@ -5,13 +5,15 @@ import select
 import socket
 import struct
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 
 import numpy as np
 
-from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.config import SensorCalibration
+from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 
 _NS = 1_000_000_000
 _RECORD = struct.Struct("<q6d")
@@ -69,8 +71,8 @@ class ImuHander:
             self._waiting.clear()
 
 
-class HandedImu:
-    """Satisfies `InertialSource` with what an `ImuHander` of another process sends."""
+class HandedImu(InertialSource):
+    """An `InertialSource` with what an `ImuHander` of another process sends."""
 
     def __init__(self, sock: socket.socket, rate_hz: float, silent_s: float) -> None:
         """Own the end of a pair of SOCK_SEQPACKET.
@@ -81,22 +83,11 @@ class HandedImu:
             silent_s: without a sample for so long, the IMU is missing.
         """
         sock.setblocking(False)
-        self.rate_hz = rate_hz
-        self._socket, self._silent_ns = sock, round(silent_s * _NS)
+        super().__init__(SensorCalibration(), silent_s)  # they come calibrated
+        self.rate_hz, self._socket = rate_hz, sock
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self._is_over = False
-        self._counts: dict[str, int] = {}
-        self._events = Health(0)
-        self._newest_ns = time.monotonic_ns()
-
-    @property
-    def temperature_c(self) -> float | None:
-        """None: it is not read."""
-        return None
-
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Do nothing: without a temperature nothing is taken off."""
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what came, see `InertialSource`."""
@@ -112,18 +103,8 @@ class HandedImu:
             else:
                 self._poll.poll(left_ns / 1e6)
         if samples:
-            self._newest_ns = time.monotonic_ns()
+            self._last_out_ns = time.monotonic_ns()
         return samples
-
-    def health(self) -> Health:
-        """Return the bits that hold now and the events since the last call."""
-        word, self._events = self._events, Health(0)
-        is_silent = time.monotonic_ns() - self._newest_ns > self._silent_ns
-        return word | (Health.IMU_MISSING if is_silent else Health(0))
-
-    def counters(self) -> dict[str, int]:
-        """Return those that the device's process reported last."""
-        return dict(self._counts)
 
     def close(self) -> None:
         """Read no more; may be called twice."""
@@ -144,7 +125,7 @@ class HandedImu:
                     samples.append(ImuSample(t_ns, np.array(numbers[:3]), np.array(numbers[3:])))
             elif kind == _WORD:
                 state = json.loads(rest)
-                self._events |= Health(state["health"]) & ~Health.IMU_MISSING  # which is looked at here
-                self._counts = state["counters"]
+                self._faults.events |= Health(state["health"]) & ~Health.IMU_MISSING  # which is looked at here
+                self._faults.counts = Counter(state["counters"])
             else:
                 self._is_over = True

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.config import SensorCalibration
 from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 from vislam.live.epoch import Epoch
 
 _NS = 1_000_000_000
-_MISSING_NS = 100_000_000
+_MISSING_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,11 +24,12 @@ class InertialTable:
     rate_hz: float
 
 
-class ReplayedImu:
-    """Satisfies `InertialSource`."""
+class ReplayedImu(InertialSource):
+    """An `InertialSource`; no recording has a temperature."""
 
     def __init__(self, table: InertialTable, epoch: Epoch, outages: tuple[tuple[float, float], ...] = ()) -> None:
         """Play a table from the epoch on; it is unplugged in each of `outages`, seconds since then."""
+        super().__init__(SensorCalibration(), _MISSING_S)  # they come calibrated
         self.rate_hz = table.rate_hz
         self._epoch = epoch
         since_ns = table.t_ns - table.t_ns[0]
@@ -36,14 +38,6 @@ class ReplayedImu:
             kept &= (since_ns < begin * _NS) | (since_ns >= end * _NS)
         self._since_ns, self._values = since_ns[kept].tolist(), table.values[kept]
         self._next = 0
-        self._newest_ns: int | None = None
-
-    @property
-    def temperature_c(self) -> None:
-        """Return None: no recording has it."""
-
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Leave the samples as they were recorded."""
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return the samples whose time has come."""
@@ -59,14 +53,8 @@ class ReplayedImu:
             row = self._values[self._next]
             samples.append(ImuSample(begin_ns + self._since_ns[self._next], row[:3].copy(), row[3:].copy()))
             self._next += 1
-        if samples:
-            self._newest_ns = now_ns
+        self._last_out_ns = now_ns if samples else max(self._last_out_ns, begin_ns)
         return samples
-
-    def health(self) -> Health:
-        """Return IMU_MISSING while there are no samples."""
-        since_ns = self._epoch.begin_ns() if self._newest_ns is None else self._newest_ns
-        return Health.IMU_MISSING if time.monotonic_ns() - since_ns > _MISSING_NS else Health(0)
 
     def counters(self) -> dict[str, int]:
         """Return how many samples were played."""

@@ -19,7 +19,8 @@ from vislam.core import interrupts
 from vislam.core.errors import HardwareError, StorageError, UsageError, VislamError
 from vislam.core.files import write_json
 from vislam.core.recording import Recording
-from vislam.hw.source import FrameSource, InertialSource, ReadingSource
+from vislam.hw.imu_source import InertialSource
+from vislam.hw.source import FrameSource, ReadingSource
 from vislam.imu import BiasMemory
 from vislam.live.beginning import Beginning
 from vislam.live.bridges import translator

@@ -15,11 +15,12 @@ from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.reading import read_json
 from vislam.datasets.calibrated import with_clock
 from vislam.datasets.camera_files import read_cameras
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.library_cameras import WITH_IMU, frame_config, gives_frames, open_frame_camera, reads_own_imu
 from vislam.hw.port_readings import PortReadings
-from vislam.hw.reading_port import check_port
 from vislam.hw.sensors import INERTIAL_KINDS, calibration_of, check_devices, open_camera, open_inertial, rate_of
-from vislam.hw.source import FrameSource, InertialSource, ReadingSource
+from vislam.hw.serial_port import check_port
+from vislam.hw.source import FrameSource, ReadingSource
 from vislam.imu import ImuNoise
 from vislam.live.device_owner import own_device
 from vislam.live.frames import NoCamera, OneCamera
@@ -189,7 +190,7 @@ class CartSensors:
             )
         for port in setup.ports.values():
             if not port.at_bridge:
-                check_port(port)
+                check_port(port.port, port.baud)
         self.close()
         self._passed = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) if at_bridge else None
         return partial(PortReadings, setup.ports, None if self._passed is None else self._passed[1])

@@ -33,9 +33,10 @@ from vislam.datasets.tables import read_frame_stamps
 from vislam.hw.cameras.library_camera import LibraryCamera
 from vislam.hw.cameras.video import VideoCamera
 from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.library_cameras import gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import calibration_of, is_video, open_camera, open_inertial, with_raw_samples
-from vislam.hw.source import CapturedImage, InertialSource
+from vislam.hw.source import CapturedImage
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.imu.series import AXES
 from vislam.runs.camera_rig import rig_of
@@ -402,10 +403,9 @@ def _rig(first: Shot, files: CalibrationConfig, hfov_deg: float) -> tuple[Rig, t
 
 def _stamp_notes(name: str, inertial: InertialSource | None) -> tuple[str, ...]:
     """Return where the stamps of an inertial source come from; those of a GY-85 and a bridge are in the docs."""
-    stamped_by = getattr(inertial, "stamped_by", None)
-    if stamped_by is None or name.startswith(("gy85", "serial")):
+    if inertial is None or not inertial.stamped_by or name.startswith(("gy85", "serial")):
         return ()
-    return (f"inertial samples of {name} are stamped by {stamped_by}",)
+    return (f"inertial samples of {name} are stamped by {inertial.stamped_by}",)
 
 
 def _camera_notes(images: Images | None) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from vislam.core.files import write_text
 from vislam.core.reading import read_toml
 from vislam.datasets.recorder import Recorder
 from vislam.hw.port_readings import PortReadings
-from vislam.hw.reading_port import check_port
+from vislam.hw.serial_port import check_port
 from vislam.sensors.geodetic import Geodetic
 from vislam.sensors.toml import SensorSetup, load_sensor_setup
 
@@ -71,7 +71,7 @@ class ReadingRecorder:
             )
         for port in ports.values():
             if not port.at_bridge:
-                check_port(port)
+                check_port(port.port, port.baud)
         self._asked = asked
         self._wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) if at_bridge else None
         self._reader: PortReadings | None = None

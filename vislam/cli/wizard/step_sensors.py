@@ -13,9 +13,10 @@ from vislam.core.errors import HardwareError, UsageError
 from vislam.core.messages import Frame, ImuSample, MagSample
 from vislam.core.recording import with_camera
 from vislam.hw.cameras.library_camera import LibraryCamera
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.library_cameras import WITH_IMU, gives_frames, open_frame_camera, open_with_imu, reads_own_imu
 from vislam.hw.sensors import open_camera, open_inertial, with_raw_samples
-from vislam.hw.source import CapturedImage, ImageSource, InertialSource
+from vislam.hw.source import CapturedImage, ImageSource
 from vislam.runs.sources import open_source
 
 Value = ImuSample | MagSample | Frame

@@ -3,8 +3,8 @@
 import numpy as np
 
 from vislam.config import SerialConfig
-from vislam.core.messages import Array, ImuSample, MagSample
-from vislam.hw.affine import Affine
+from vislam.core.messages import Array
+from vislam.hw.accel_at_gyro import AccelBefore
 from vislam.hw.bridge.protocol import SAMPLE_WIRE_BYTES, Ages, Chips, Hello, RawSample, Spent
 from vislam.hw.chips import mpu6050
 from vislam.hw.health import Health
@@ -22,26 +22,25 @@ _MOST_APART = 1.5  # periods between samples that follow each other
 
 
 class Behind:
-    """Turns counts into samples, by what the device states about its chips.
+    """How old the counts of the chips are, by what the device states about them.
 
     A GY-85's filters are known from the settings. Any other chip states its own in a frame of `Ages`; before it has,
     nothing is made of its counts.
     """
 
     def __init__(self, config: SerialConfig) -> None:
-        """Take the calibration and what is known of the line."""
+        """Take what is known of the line and of a GY-85."""
         self.hello: Hello | None = None
         self._ages: Ages | None = None
         self._config = config
         self._wire_s = SAMPLE_WIRE_BYTES * _BITS_PER_BYTE / config.baud
         self._spent_s = _CHIPS_S
-        self._maps: tuple[Affine, Affine, Affine] | None = None  # gyro, accel, mag
-        self._accel_before: tuple[int, Array] | None = None  # device time, counts
+        self._accel_us, self._at_gyro = 0, AccelBefore()
 
     def forget(self) -> None:
         """Another device may answer from now on."""
         self.hello = self._ages = None
-        self._accel_before = None
+        self._at_gyro.forget()
         self._spent_s = _CHIPS_S
 
     def take(self, stated: Ages | Spent) -> None:
@@ -58,15 +57,9 @@ class Behind:
 
     def greet(self, hello: Hello) -> None:
         """Take what the device states about its chips."""
-        before, c = self.hello, self._config.calibration
+        if self.hello is None or self.hello.accel_id != hello.accel_id:
+            self._at_gyro.forget()
         self.hello = hello
-        if before is None or _scales(before) != _scales(hello):
-            self._accel_before = None
-            self._maps = (
-                Affine.of(c.gyro_axes, c.gyro_matrix, c.gyro_bias_rad_s, hello.gyro_nrad_s * 1e-9),
-                Affine.of(c.accel_axes, c.accel_matrix, c.accel_bias_m_s2, hello.accel_nm_s2 * 1e-9),
-                Affine.of(c.mag_axes, c.mag_matrix, c.mag_bias_ut, hello.mag_pt * 1e-6),
-            )
 
     @property
     def is_known(self) -> bool:
@@ -118,48 +111,30 @@ class Behind:
         known = ", ".join(f"{name} 0x{value:02x}" for value, name in mpu6050.IDS.items())
         return f"a chip with the id 0x{hello.accel_id:02x}, and the sketch knows {known}"
 
-    def field(self, raw: RawSample, stamp_ns: int) -> MagSample:
-        """Return the sample of the magnetometer whose frame was stamped so; call it where all is known."""
-        assert self._maps is not None
-        mag_map = self._maps[2]
-        ages = self._stated
-        delay_ns = round(_MAG_DELAY_S * _NS) if ages is None else 1000 * ages.mag_us
-        field_ut = mag_map.matrix @ np.array(raw.mag, dtype=np.float64) + mag_map.offset
-        return MagSample(stamp_ns - delay_ns, field_ut)
+    @property
+    def mag_delay_ns(self) -> int:
+        """From a measurement of the magnetometer to the time of its sample."""
+        return round(_MAG_DELAY_S * _NS) if self._stated is None else 1000 * self._stated.mag_us
 
-    def inertial(self, raw: RawSample, stamp_ns: int, drift_rad_s: Array) -> ImuSample:
-        """Return the inertial sample of a frame that was stamped so, at the time of what the gyro's filter shows."""
-        assert self._maps is not None
-        gyro_map, accel_map, _ = self._maps
-        ages = self._stated
-        delay_ns = round(self._config.filter_s * _NS) if ages is None else 1000 * ages.gyro_us
-        rate = gyro_map.matrix @ np.array(raw.gyro, dtype=np.float64) + gyro_map.offset
-        rate -= drift_rad_s
-        accel = np.array(raw.accel, dtype=np.float64)
-        if ages is not None:
-            accel = self._at_gyro(raw.t_us, accel, ages)
-        return ImuSample(stamp_ns - delay_ns, rate, accel_map.matrix @ accel + accel_map.offset)
+    @property
+    def gyro_delay_ns(self) -> int:
+        """From what the gyro's filter shows to the time of its sample."""
+        return round(self._config.filter_s * _NS) if self._stated is None else 1000 * self._stated.gyro_us
+
+    def accel(self, raw: RawSample) -> Array:
+        """Return the accelerometer's counts [3] at the time of the gyro's."""
+        accel, ages = np.array(raw.accel, dtype=np.float64), self._stated
+        if ages is None or self.hello is None:
+            return accel
+        since_us, self._accel_us = (raw.t_us - self._accel_us) % _CLOCK, raw.t_us
+        if not 0 < since_us * self.hello.rate_hz <= _MOST_APART * 1e6:
+            self._at_gyro.forget()
+        return self._at_gyro.moved(accel[None], (ages.gyro_us - ages.accel_us) / max(since_us, 1))[0]
 
     @property
     def _stated(self) -> Ages | None:
         return self._ages if self.hello is not None and _is_one_chip(self.hello) else None
 
-    def _at_gyro(self, t_us: int, accel: Array, ages: Ages) -> Array:
-        """Return counts [3] on the line of the last two, at the time of the gyro's; `FifoSamples` does the same."""
-        before, self._accel_before = self._accel_before, (t_us, accel)
-        assert self.hello is not None
-        if before is None:
-            return accel
-        since_us = (t_us - before[0]) % _CLOCK
-        if not 0 < since_us * self.hello.rate_hz <= _MOST_APART * 1e6:
-            return accel
-        share = (ages.gyro_us - ages.accel_us) / since_us
-        return np.asarray(accel - share * (accel - before[1]))
-
 
 def _is_one_chip(hello: Hello) -> bool:
     return hello.accel_id in mpu6050.IDS
-
-
-def _scales(hello: Hello) -> tuple[int, ...]:
-    return hello.accel_id, hello.accel_nm_s2, hello.gyro_nrad_s, hello.mag_pt

@@ -9,8 +9,10 @@ The structs, flags and values below are the whole table; firmware/vislam_bridge/
 
 import binascii
 import struct
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from enum import IntFlag
+from functools import partial
 
 PROTOCOL_VERSION = 1
 SAMPLE_TYPE, HELLO_TYPE, COUNTS_TYPE, PASSED_TYPE, AGES_TYPE, SPENT_TYPE = 1, 2, 3, 4, 5, 6
@@ -145,22 +147,18 @@ def encode(message: RawSample | Hello | Counts | Passed | Ages | Spent) -> bytes
     if isinstance(message, RawSample):
         m = message
         body = _SAMPLE.pack(SAMPLE_TYPE, m.sequence, m.t_us, m.status, *m.accel, *m.gyro, *m.mag, m.temperature)
-    elif isinstance(message, Counts):
-        body = _COUNTS.pack(COUNTS_TYPE, message.sequence, message.t_us, message.left, message.right)
-    elif isinstance(message, Spent):
-        body = _SPENT.pack(SPENT_TYPE, message.sequence, message.t_us, message.spent_us)
     elif isinstance(message, Passed):
         body = _PASSED.pack(PASSED_TYPE, message.sequence, message.t_us) + message.data
-    elif isinstance(message, Ages):
-        a = message
-        body = _AGES.pack(AGES_TYPE, a.sequence, a.t_us, a.accel_id, a.gyro_us, a.accel_us, a.mag_us)
-    else:
+    elif isinstance(message, Hello):
         h = message
         body = _HELLO.pack(
             HELLO_TYPE, h.sequence, h.t_us, PROTOCOL_VERSION, h.chips, h.accel_id, h.gyro_id, h.mag_id, h.rate_hz,
             h.accel_nm_s2, h.gyro_nrad_s, h.mag_pt, h.temperature_nk, h.temperature_mc,
             h.accel_limit, h.gyro_limit, h.mag_limit,
         )  # fmt: skip
+    else:
+        kind = next(kind for kind, (of, _) in _PLAIN.items() if isinstance(message, of))
+        body = _PLAIN[kind][1].pack(kind, *(getattr(message, field.name) for field in fields(message)))
     return stuff(body + _CRC.pack(binascii.crc_hqx(body, _CRC_BEGIN))) + b"\0"
 
 
@@ -228,32 +226,28 @@ def _hello(body: bytes) -> Hello | OtherVersion | None:
     return hello if all(scales) else None
 
 
-def _counts(body: bytes) -> Counts | None:
-    return Counts(*_COUNTS.unpack(body)[1:]) if len(body) == _COUNTS.size else None
-
-
 def _passed(body: bytes) -> Passed | None:
     _, sequence, t_us = _PASSED.unpack_from(body)
     data = body[_PASSED.size :]
     return Passed(sequence, t_us, data) if len(data) <= MOST_PASSED else None
 
 
-def _ages(body: bytes) -> Ages | None:
-    return Ages(*_AGES.unpack(body)[1:]) if len(body) == _AGES.size else None
-
-
-def _spent(body: bytes) -> Spent | None:
-    return Spent(*_SPENT.unpack(body)[1:]) if len(body) == _SPENT.size else None
+def _plain(made: type[Counts | Ages | Spent], layout: struct.Struct, body: bytes) -> Counts | Ages | Spent | None:
+    return made(*layout.unpack(body)[1:]) if len(body) == layout.size else None
 
 
 _ALL_STATUS = sum(Status)
-_READERS = {
+# those whose fields stand in a frame one after the other
+_PLAIN: dict[int, tuple[type[Counts | Ages | Spent], struct.Struct]] = {
+    COUNTS_TYPE: (Counts, _COUNTS),
+    AGES_TYPE: (Ages, _AGES),
+    SPENT_TYPE: (Spent, _SPENT),
+}
+_READERS: dict[int, Callable[[bytes], Message | None]] = {
     SAMPLE_TYPE: _sample,
     HELLO_TYPE: _hello,
-    COUNTS_TYPE: _counts,
     PASSED_TYPE: _passed,
-    AGES_TYPE: _ages,
-    SPENT_TYPE: _spent,
+    **{kind: partial(_plain, *made) for kind, made in _PLAIN.items()},
 }
 
 

@@ -5,10 +5,15 @@ from vislam.hw.chips.bus import BusError, I2cBus, SettingsLostError, kernel_driv
 from vislam.hw.chips.field import Magnetometer
 from vislam.hw.chips.fifo_imu import FifoImu, ImuSetup
 from vislam.hw.chips.hmc5883l import Hmc5883l
-from vislam.hw.chips.ids import IMU_NAMES, identify
-from vislam.hw.chips.imus import find_imu, use_clone
 from vislam.hw.chips.itg3205 import Itg3205
-from vislam.hw.chips.magnetometer import find_magnetometer
+from vislam.hw.chips.known import (
+    IMU_NAMES,
+    find_any_magnetometer,
+    find_imu,
+    find_magnetometer,
+    identify,
+    use_clone,
+)
 from vislam.hw.chips.self_test import SelfTest
 
 __all__ = [
@@ -23,6 +28,7 @@ __all__ = [
     "Magnetometer",
     "SelfTest",
     "SettingsLostError",
+    "find_any_magnetometer",
     "find_imu",
     "find_magnetometer",
     "identify",

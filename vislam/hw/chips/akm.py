@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.core.messages import Array
-from vislam.hw.chips.bus import I2cBus, SettingsLostError
-from vislam.hw.chips.field import FieldReading
-from vislam.hw.chips.self_test import SelfTest
+from vislam.hw.chips.bus import I2cBus, kept
+from vislam.hw.chips.field import FieldReading, Magnetometer
 from vislam.hw.timing import Clock
 
 ADDRESS = 0x0C
@@ -43,13 +42,13 @@ AK09916 = Variant("AK09916", 0x01, 0x09, 0x10, 9, 0x31, 0x08, None, ((0, 1), (1,
 AK8963 = Variant("AK8963", 0x00, 0x48, 0x02, 8, 0x0A, 0x16, 0x10, ((1, 1), (0, 1), (2, -1)))
 
 
-class Akm:
+class Akm(Magnetometer):
     """One chip of either kind, measuring at 100 Hz."""
 
     rate_hz = 100.0
 
-    def __init__(self, bus: I2cBus, variant: Variant) -> None:
-        """Take settings; nothing is sent yet. The range is fixed, 4.9 mT."""
+    def __init__(self, variant: Variant, bus: I2cBus, range_ga: float = 0.0, address: int = ADDRESS) -> None:
+        """Take settings; nothing is sent yet. Range and address are fixed: 4.9 mT."""
         self._bus, self._variant, self.name = bus, variant, variant.name
         self._reads = bus.prepare([(ADDRESS, variant.control, 1), (ADDRESS, variant.status, variant.length)])
         self._scale: Array = np.ones(3)
@@ -71,15 +70,9 @@ class Akm:
 
     def read(self) -> FieldReading | None:
         """Return a new measurement, None if there is none yet; never waits. Raises BusError, SettingsLostError."""
-        data = self._reads.run()
-        if data[0] != self._variant.continuous_100_hz:
-            raise SettingsLostError(f"{self.name}: mode 0x{data[0]:02x}, given 0x{self._variant.continuous_100_hz:02x}")
-        if not data[1] & _READY:
+        data = kept(self.name, self._reads.run(), bytes([self._variant.continuous_100_hz]))
+        if not data[0] & _READY:
             return None
-        counts = np.array(struct.unpack_from("<3h", data, 2), dtype=np.float64) * self._scale
+        counts = np.array(struct.unpack_from("<3h", data, 1), dtype=np.float64) * self._scale
         field_ut = _UT_PER_LSB * np.array([sign * counts[axis] for axis, sign in self._variant.turned])
         return FieldReading(field_ut, bool(data[-1] & _OVERFLOW))
-
-    def self_test(self, clock: Clock) -> SelfTest:
-        """Return that none is run."""
-        return SelfTest(self.name, None, "its self-test is not run; the field's plausibility is checked")

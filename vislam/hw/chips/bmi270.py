@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from vislam.core.errors import HardwareError
-from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
-from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, ImuSetup, RawSamples, Waiting, next_of, popped, refuse_other
+from vislam.hw.chips.bus import MAX_READS, I2cBus
+from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, FifoImu, ImuSetup, RawSamples, Waiting, next_of
 from vislam.hw.timing import Clock
 
 ADDRESSES = (0x68, 0x69)
@@ -38,28 +38,25 @@ _ARRAY = re.compile(r"config_file\[\w*\]\s*=\s*\{([^}]*)\}")
 _HELP = "Bosch's driver on GitHub (BMI270_SensorAPI) has it: name bmi270_maximum_fifo.c or bmi270.c in board.firmware"
 
 
-class Bmi270:
+class Bmi270(FifoImu):
     """One chip, filters of about 0.4 of the rate in both sensors.
 
     Their delays are those of second-order filters of such a width (0.225 periods): no delay is taken from the data
     sheet.
     """
 
-    start_up_s = 0.1
-    doubt = ""
     max_zero_deg_s = 1.0
 
     def __init__(self, bus: I2cBus, setup: ImuSetup, address: int = ADDRESSES[0]) -> None:
         """Take settings; nothing is sent yet. Raises HardwareError for a configuration that cannot be read."""
-        self._bus, self.address = bus, address
-        self.name = IDS[0x24]
+        super().__init__(bus, address, IDS[0x24])
         rate = next_of(setup.rate_hz, _RATES)
         gyro, accel = next_of(setup.gyro_range_deg_s, _GYRO_RANGES), next_of(setup.accel_range_g, _ACCEL_RANGES)
         self.rate_hz = float(rate)
         self.gyro_rad_s = float(np.deg2rad(gyro / 32768.0))
         self.accel_m_s2 = accel / 32768.0 * G_M_S2
         self.gyro_delay_s = self.accel_delay_s = 0.225 / (0.4 * rate)
-        self._settings = bytes(
+        self._kept = bytes(
             (_ACCEL_NORMAL | _RATES[rate], _ACCEL_RANGES[accel], _GYRO_NORMAL | _RATES[rate], _GYRO_RANGES[gyro])
         )
         self._configuration = configuration(setup.firmware)
@@ -73,15 +70,15 @@ class Bmi270:
 
         Raises BusError, HardwareError.
         """
-        refuse_other(self._bus, self.address, self._bus.read(self.address, ID_REGISTER, 1)[0], IDS)
-        self._bus.write(self.address, _CMD, _SOFT_RESET)
+        self._identified(ID_REGISTER, IDS)
+        self._write(_CMD, _SOFT_RESET)
         clock.sleep_until(clock.now_ns() + round(_RESET_S * 1e9))
-        self._bus.write(self.address, _PWR_CONF, 0)
+        self._write(_PWR_CONF, 0)
         clock.sleep_until(clock.now_ns() + round(_WAKE_S * 1e9))
         self._send()
         for _ in range(_START_ASKED):
             clock.sleep_until(clock.now_ns() + round(_START_S * 1e9))
-            status = self._bus.read(self.address, _INTERNAL_STATUS, 1)[0] & 0x0F
+            status = self._read(_INTERNAL_STATUS)[0] & 0x0F
             if status == _STARTED:
                 break
         else:
@@ -89,41 +86,35 @@ class Bmi270:
                 f"{self._bus.path}: the {self.name} does not take its configuration (status {status}); {_HELP}"
             )
         self._cross = self._read_cross()
-        for offset, value in enumerate(self._settings):
-            self._bus.write(self.address, _ACC_CONF + offset, value)
-        for offset, value in enumerate((0, _WITHOUT_HEADERS)):  # the oldest frames are overwritten
-            self._bus.write(self.address, _FIFO_CONFIG_0 + offset, value)
-        self._bus.write(self.address, _PWR_CTRL, _ALL_ON)
+        self._write(_ACC_CONF, *self._kept)
+        self._write(_FIFO_CONFIG_0, 0, _WITHOUT_HEADERS)  # the oldest frames are overwritten
+        self._write(_PWR_CTRL, _ALL_ON)
         self.empty()
 
     def _read_cross(self) -> float:
         """Return the chip's factor_zx, seven bits with sign of 2**-9, as Bosch's driver finds it."""
         is_small = len(self._configuration) <= _SMALL_BYTES
         if not is_small:
-            self._bus.write(self.address, _FEATURE_PAGE, 0)
-        found = self._bus.read(self.address, _SMALL_CAS if is_small else _CAS, 1)[0] & 0x7F
+            self._write(_FEATURE_PAGE, 0)
+        found = self._read(_SMALL_CAS if is_small else _CAS)[0] & 0x7F
         return (found - 128 if found & 0x40 else found) / 512.0
 
     def _send(self) -> None:
-        self._bus.write(self.address, _INIT_CTRL, 0)
+        self._write(_INIT_CTRL, 0)
         for first in range(0, len(self._configuration), _CHUNK):
             word = first // 2
             self._bus.write_block(self.address, _INIT_ADDR, bytes((word & 0x0F, word >> 4)))
             self._bus.write_block(self.address, _INIT_DATA, self._configuration[first : first + _CHUNK])
-        self._bus.write(self.address, _INIT_CTRL, 1)
+        self._write(_INIT_CTRL, 1)
 
     def waiting(self) -> Waiting:
-        """Return how many frames wait; after an overflow none, and the FIFO is emptied. Raises BusError."""
+        """Return how many frames wait, see `FifoImu`."""
         status, low, high = self._count.run()
-        count = (high & 0x3F) << 8 | low
-        if status & _FULL or count > FIFO_BYTES - FRAME_BYTES:
-            self.empty()
-            return Waiting(0, True)
-        return Waiting(count // FRAME_BYTES, False)
+        return self._whole((high & 0x3F) << 8 | low, bool(status & _FULL), FIFO_BYTES, FRAME_BYTES)
 
     def take(self, units: int) -> RawSamples:
         """Take `units` frames, each the gyro and then the accelerometer; raises BusError: then `empty` it."""
-        data = popped(self._pops, units)
+        data = self._popped(units)
         if not data:
             return NO_SAMPLES
         counts = np.frombuffer(data, dtype="<i2").reshape(-1, 6).astype(np.float64)
@@ -132,14 +123,10 @@ class Bmi270:
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""
-        self._bus.write(self.address, _CMD, _FLUSH)
+        self._write(_CMD, _FLUSH)
 
-    def temperature_c(self) -> float:
-        """Return the chip's temperature; raises BusError, SettingsLostError."""
-        data = self._watch.run()
-        if data[:4] != self._settings:
-            raise SettingsLostError(f"{self.name}: settings {data[:4].hex()}, given {self._settings.hex()}")
-        return 23.0 + int.from_bytes(data[4:], "little", signed=True) / 512.0
+    def _celsius(self, data: bytes) -> float:
+        return 23.0 + int.from_bytes(data, "little", signed=True) / 512.0
 
 
 def configuration(file: str | None) -> bytes:

@@ -53,6 +53,13 @@ class SettingsLostError(HardwareError):
     """A chip no longer has the settings that it was given: it was without power for a moment; set it up again."""
 
 
+def kept(name: str, data: bytes, given: bytes) -> bytes:
+    """Return what follows the settings that data begin with; raises SettingsLostError where they are others."""
+    if data[: len(given)] != given:
+        raise SettingsLostError(f"{name}: settings {data[: len(given)].hex()}, given {given.hex()}")
+    return data[len(given) :]
+
+
 def _load_smbus2() -> Any:
     try:
         import smbus2.smbus2 as module

@@ -6,7 +6,7 @@ import numpy as np
 
 from vislam.core.messages import Array
 from vislam.hw.chips.bus import I2cBus, SettingsLostError
-from vislam.hw.chips.field import FieldReading
+from vislam.hw.chips.field import FieldReading, Magnetometer
 from vislam.hw.chips.self_test import SelfTest
 from vislam.hw.timing import Clock
 
@@ -33,7 +33,7 @@ _SELF_TEST_PERIOD_S = 1.0 / 15.0
 _POSITIVE, _NEGATIVE = 1, 2
 
 
-class Hmc5883l:
+class Hmc5883l(Magnetometer):
     """One chip, measuring at 75 Hz.
 
     Attributes:

@@ -7,8 +7,8 @@ public drivers. The magnetometer answers at 0x0C from then on.
 import numpy as np
 
 from vislam.core.errors import HardwareError
-from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
-from vislam.hw.chips.fifo_imu import G_M_S2, ImuSetup, RawSamples, Waiting, divided, next_of, popped, refuse_other
+from vislam.hw.chips.bus import MAX_READS, I2cBus
+from vislam.hw.chips.fifo_imu import G_M_S2, FifoImu, ImuSetup, RawSamples, Waiting, divided, next_of
 from vislam.hw.chips.mpu6050 import SAMPLE_BYTES, decoded
 from vislam.hw.timing import Clock
 
@@ -35,20 +35,15 @@ _RESET_S, _WAKE_S = 0.1, 0.02
 FIFO_BYTES = 512  # by the data sheet; where a chip has more, no more is used
 
 
-class Icm20948:
+class Icm20948(FifoImu):
     """One chip, at 1125 Hz divided by a whole number, with filters of 120 and 111 Hz.
 
     Their delays are those of second-order filters of such widths (0.225 periods): the data sheet states none.
     """
 
-    start_up_s = 0.1
-    doubt = ""
-    max_zero_deg_s = 5.0
-
     def __init__(self, bus: I2cBus, setup: ImuSetup, address: int = ADDRESSES[0]) -> None:
         """Take settings; nothing is sent yet."""
-        self._bus, self.address = bus, address
-        self.name = IDS[0xEA]
+        super().__init__(bus, address, IDS[0xEA])
         divider = divided(setup.rate_hz, _INTERNAL_HZ)
         self.rate_hz = _INTERNAL_HZ / divider
         gyro = _GYRO_RANGES[next_of(setup.gyro_range_deg_s, _GYRO_RANGES)]
@@ -67,56 +62,42 @@ class Icm20948:
         self._count = bus.prepare([(address, _OVERFLOWS, 1), (address, _FIFO_COUNT, 2)])
         self._pops = bus.prepare([(address, _FIFO_DATA, SAMPLE_BYTES)] * MAX_READS)
         self._watch = bus.prepare([(address, _USER_CTRL, 1), (address, _FIFO_EN_2, 1), (address, _TEMPERATURE, 2)])
+        self._kept = bytes((_FIFO_ON, _GYRO_AND_ACCEL))
 
     def configure(self, clock: Clock) -> None:
         """Reset the chip, set it up and start it with an empty FIFO; raises BusError, HardwareError."""
-        self._bus.write(self.address, _BANK, 0)
-        refuse_other(self._bus, self.address, self._bus.read(self.address, ID_REGISTER, 1)[0], IDS)
-        self._bus.write(self.address, _PWR_MGMT_1, _RESET)
-        clock.sleep_until(clock.now_ns() + round(_RESET_S * 1e9))
-        if self._bus.read(self.address, _PWR_MGMT_1, 1)[0] & _RESET:
-            raise HardwareError(f"{self._bus.path}: the {self.name} does not come out of its reset; check its supply")
-        self._bus.write(self.address, _PWR_MGMT_1, _CLOCK_AUTO)  # also wakes it up
+        self._write(_BANK, 0)
+        self._identified(ID_REGISTER, IDS)
+        self._write(_PWR_MGMT_1, _RESET)
+        self._await_reset(clock, _PWR_MGMT_1, _RESET, _RESET_S)
+        self._write(_PWR_MGMT_1, _CLOCK_AUTO)  # also wakes it up
         clock.sleep_until(clock.now_ns() + round(_WAKE_S * 1e9))
-        self._bus.write(self.address, _BANK, 2 << 4)
+        self._write(_BANK, 2 << 4)
         for register, value in self._settings:
-            self._bus.write(self.address, register, value)
-        kept = tuple((register, self._bus.read(self.address, register, 1)[0]) for register, _ in self._settings)
-        self._bus.write(self.address, _BANK, 0)  # where all that is read while it runs lies
-        if kept != self._settings:
+            self._write(register, value)
+        found = tuple((register, self._read(register)[0]) for register, _ in self._settings)
+        self._write(_BANK, 0)  # where all that is read while it runs lies
+        if found != self._settings:
             raise HardwareError(f"{self._bus.path}: the {self.name} does not keep its settings; check its supply")
-        self._bus.write(self.address, _INT_PIN_CFG, _BYPASS)  # the magnetometer comes to the bus
-        self._bus.write(self.address, _FIFO_MODE, _STREAM)
-        self._bus.write(self.address, _FIFO_EN_2, _GYRO_AND_ACCEL)
-        self._bus.write(self.address, _USER_CTRL, _FIFO_ON)
+        self._write(_INT_PIN_CFG, _BYPASS)  # the magnetometer comes to the bus
+        self._write(_FIFO_MODE, _STREAM)
+        self._write(_FIFO_EN_2, _GYRO_AND_ACCEL)
+        self._write(_USER_CTRL, _FIFO_ON)
         self.empty()
 
     def waiting(self) -> Waiting:
-        """Return how many samples wait; after an overflow none, and the FIFO is emptied. Raises BusError.
-
-        Bytes are overwritten one by one then, so that nothing in it begins where a sample does.
-        """
+        """Return how many samples wait, see `FifoImu`."""
         overflows, high, low = self._count.run()
-        count = (high & 0x1F) << 8 | low
-        if overflows & _ALL_FIFOS or count > FIFO_BYTES - SAMPLE_BYTES:
-            self.empty()
-            return Waiting(0, True)
-        return Waiting(count // SAMPLE_BYTES, False)
+        return self._whole((high & 0x1F) << 8 | low, bool(overflows & _ALL_FIFOS), FIFO_BYTES, SAMPLE_BYTES)
 
     def take(self, units: int) -> RawSamples:
         """Take `units` samples; raises BusError: then `empty` it."""
-        return decoded(popped(self._pops, units))
+        return decoded(self._popped(units))
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""
-        self._bus.write(self.address, _FIFO_RST, _ALL_FIFOS)
-        self._bus.write(self.address, _FIFO_RST, 0)
+        self._write(_FIFO_RST, _ALL_FIFOS)
+        self._write(_FIFO_RST, 0)
 
-    def temperature_c(self) -> float:
-        """Return the chip's temperature; raises BusError, SettingsLostError."""
-        data = self._watch.run()
-        if data[:2] != bytes((_FIFO_ON, _GYRO_AND_ACCEL)):
-            raise SettingsLostError(
-                f"{self.name}: settings {data[:2].hex()}, given {_FIFO_ON:02x}{_GYRO_AND_ACCEL:02x}"
-            )
-        return int.from_bytes(data[2:], "big", signed=True) / 333.87 + 21.0
+    def _celsius(self, data: bytes) -> float:
+        return int.from_bytes(data, "big", signed=True) / 333.87 + 21.0

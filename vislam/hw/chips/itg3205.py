@@ -3,7 +3,7 @@
 import struct
 
 from vislam.core.errors import HardwareError
-from vislam.hw.chips.bus import I2cBus, SettingsLostError
+from vislam.hw.chips.bus import I2cBus, kept
 from vislam.hw.timing import Clock
 
 ADDRESS = 0x68
@@ -55,8 +55,5 @@ class Itg3205:
 
     def read(self) -> tuple[float, int, int, int]:
         """Return temperature in deg C and the counts of x, y, z; raises BusError, SettingsLostError."""
-        data = self._burst.run()
-        if data[:2] != self._settings:
-            raise SettingsLostError(f"{self.name}: settings {data[:2].hex()}, given {self._settings.hex()}")
-        temperature, x, y, z = struct.unpack_from(">4h", data, 6)
+        temperature, x, y, z = struct.unpack_from(">4h", kept(self.name, self._burst.run(), self._settings), 4)
         return 35.0 + (temperature + 13200) / 280.0, x, y, z

@@ -10,8 +10,8 @@ import numpy as np
 
 from vislam.core.errors import HardwareError
 from vislam.core.messages import Array
-from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
-from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, ImuSetup, RawSamples, Waiting, next_of, popped, refuse_other
+from vislam.hw.chips.bus import MAX_READS, I2cBus
+from vislam.hw.chips.fifo_imu import G_M_S2, NO_SAMPLES, FifoImu, ImuSetup, RawSamples, Waiting, next_of
 from vislam.hw.timing import Clock
 
 ADDRESSES = (0x6A, 0x6B)
@@ -39,39 +39,37 @@ GYRO, ACCEL = 0x01, 0x02  # sensors as tags name them
 WORD_BYTES, FIFO_WORDS = 7, 512
 
 
-class Lsm6dsox:
+class Lsm6dsox(FifoImu):
     """One chip; both sensors in high-performance mode at one rate, which the chip's FREQ_FINE corrects.
 
     The gyro's second filter lets through a third of the rate, the accelerometer's half. Their delays are those of
     second-order filters of such widths (0.225 periods of the cut-off): ST's data sheets state none.
     """
 
-    start_up_s = 0.1  # the gyro's turn-on time is 35 ms, its filters settle then
+    # start_up_s: the gyro's turn-on time is 35 ms, its filters settle then
     max_zero_deg_s = 10.0  # 1 typical over the life of a soldered chip; none is stated as the largest
 
     def __init__(self, bus: I2cBus, setup: ImuSetup, address: int = ADDRESSES[0]) -> None:
         """Take settings; nothing is sent yet."""
-        self._bus, self.address = bus, address
-        self.name = IDS[0x6C]
+        super().__init__(bus, address, IDS[0x6C])
         self._code = _RATES[next_of(setup.rate_hz, _RATES)]
-        self._is_twin, self.doubt = setup.named == TWIN, ""
+        self._is_twin = setup.named == TWIN
         twice = 2 if self._is_twin else 1
         gyro, accel = next_of(setup.gyro_range_deg_s, _GYRO_RANGES), next_of(setup.accel_range_g / twice, _ACCEL_RANGES)
         self.rate_hz = _NOMINAL_HZ / _HALVINGS[self._code]
         self.gyro_rad_s = float(np.deg2rad(1e-3 * _GYRO_MDEG_S[gyro]))
         self.accel_m_s2 = 1e-3 * twice * _ACCEL_MG[accel] * G_M_S2
         self.gyro_delay_s, self.accel_delay_s = 0.225 * 3.0 / self.rate_hz, 0.225 * 2.0 / self.rate_hz
-        self._settings = bytes((self._code << 4 | _ACCEL_RANGES[accel] << 2, self._code << 4 | _GYRO_RANGES[gyro] << 2))
+        self._kept = bytes((self._code << 4 | _ACCEL_RANGES[accel] << 2, self._code << 4 | _GYRO_RANGES[gyro] << 2))
         self._count = bus.prepare([(address, _FIFO_STATUS1, 2)])
-        self._pairs = bus.prepare([(address, _FIFO_TAG, 2 * WORD_BYTES)] * MAX_READS)
+        self._pops = bus.prepare([(address, _FIFO_TAG, 2 * WORD_BYTES)] * MAX_READS)
         self._single = bus.prepare([(address, _FIFO_TAG, WORD_BYTES)])
         self._watch = bus.prepare([(address, _CTRL1_XL, 2), (address, _TEMPERATURE, 2)])
         self._half: dict[int, tuple[int, Array]] = {}  # by sensor: time slot and counts of a word without its other
 
     def configure(self, clock: Clock) -> None:
         """Reset the chip, set it up and start it with an empty FIFO; raises BusError, HardwareError."""
-        found = self._bus.read(self.address, ID_REGISTER, 1)[0]
-        self.name = refuse_other(self._bus, self.address, found, IDS)
+        self.name, found = self._identified(ID_REGISTER, IDS)
         if found == _SHARED_ID:
             self.name = TWIN.upper() if self._is_twin else self.name
             self.doubt = "an LSM6DSOX and an LSM6DSO32 have one id"
@@ -79,23 +77,16 @@ class Lsm6dsox:
             raise HardwareError(
                 f"{self._bus.path}: an {TWIN.upper()} is asked for, the chip is an {self.name}; name that"
             )
-        self._bus.write(self.address, _CTRL3_C, _RESET)
-        for _ in range(_RESET_ASKED):
-            clock.sleep_until(clock.now_ns() + round(_RESET_S * 1e9))
-            if not self._bus.read(self.address, _CTRL3_C, 1)[0] & _RESET:
-                break
-        else:
-            raise HardwareError(f"{self._bus.path}: the {self.name} does not come out of its reset; check its supply")
-        error = self._bus.read(self.address, _FREQ_FINE, 1)[0]
+        self._write(_CTRL3_C, _RESET)
+        self._await_reset(clock, _CTRL3_C, _RESET, _RESET_S, _RESET_ASKED)
+        error = self._read(_FREQ_FINE)[0]
         fine = error - 256 if error > 127 else error
         self.rate_hz = _NOMINAL_HZ * (1.0 + _FREQ_STEP * fine) / _HALVINGS[self._code]
         if found == _ISM330DHCX_ID:
-            self._bus.write(self.address, _CTRL9_XL, _DEVICE_CONF)  # "set to 1": DS13012, 9.19, and ST's examples
-        self._bus.write(self.address, _CTRL3_C, _BLOCK_UPDATE | _INCREMENT)
-        for offset, value in enumerate((0, 0, self._code << 4 | self._code)):  # no watermark; both are batched
-            self._bus.write(self.address, _FIFO_CTRL1 + offset, value)
-        for offset, value in enumerate(self._settings):
-            self._bus.write(self.address, _CTRL1_XL + offset, value)
+            self._write(_CTRL9_XL, _DEVICE_CONF)  # "set to 1": DS13012, 9.19, and ST's examples
+        self._write(_CTRL3_C, _BLOCK_UPDATE | _INCREMENT)
+        self._write(_FIFO_CTRL1, 0, 0, self._code << 4 | self._code)  # no watermark; both are batched
+        self._write(_CTRL1_XL, *self._kept)
         self.empty()
 
     def waiting(self) -> Waiting:
@@ -106,7 +97,7 @@ class Lsm6dsox:
 
     def take(self, units: int) -> RawSamples:
         """Take words and return the samples that are whole; raises BusError: then `empty` it."""
-        data = popped(self._pairs, units // 2)
+        data = self._popped(units // 2)
         if units % 2:
             data += self._single.run()
         both = list(self._paired(data))
@@ -116,16 +107,12 @@ class Lsm6dsox:
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""
-        self._bus.write(self.address, _FIFO_CTRL4, 0)  # bypass empties it
-        self._bus.write(self.address, _FIFO_CTRL4, _CONTINUOUS)
+        self._write(_FIFO_CTRL4, 0)  # bypass empties it
+        self._write(_FIFO_CTRL4, _CONTINUOUS)
         self._half = {}
 
-    def temperature_c(self) -> float:
-        """Return the chip's temperature; raises BusError, SettingsLostError."""
-        data = self._watch.run()
-        if data[:2] != self._settings:
-            raise SettingsLostError(f"{self.name}: settings {data[:2].hex()}, given {self._settings.hex()}")
-        return 25.0 + int.from_bytes(data[2:], "little", signed=True) / 256.0
+    def _celsius(self, data: bytes) -> float:
+        return 25.0 + int.from_bytes(data, "little", signed=True) / 256.0
 
     def _paired(self, data: bytes) -> Iterator[tuple[Array, Array]]:
         """Yield gyro and accelerometer counts [3] of one time slot each.

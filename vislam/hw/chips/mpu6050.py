@@ -7,21 +7,19 @@ from then on.
 
 import numpy as np
 
-from vislam.core.errors import HardwareError
 from vislam.core.messages import Array
-from vislam.hw.chips.bus import MAX_READS, I2cBus, SettingsLostError
+from vislam.hw.chips.bus import MAX_READS, I2cBus
 from vislam.hw.chips.fifo_imu import (
     G_M_S2,
     NO_SAMPLES,
     SAMPLES,
+    FifoImu,
     ImuSetup,
     RawSamples,
     Waiting,
     divided,
     fresh,
     next_of,
-    popped,
-    refuse_other,
 )
 from vislam.hw.chips.self_test import SelfTest
 from vislam.hw.timing import Clock
@@ -58,95 +56,79 @@ _FIRST_LIMITS, _LATER_LIMITS = (0.86, 1.14), (0.71, 1.41)
 _MOVED, _NO_RESPONSE = 0.1, 0.1  # of the trim; noise is below 0.03
 
 
-class Mpu6050:
+class Mpu6050(FifoImu):
     """One chip, at 1000 Hz divided by a whole number, with filters of 98 and 94 Hz (MPU-9250: 92 and 99)."""
 
-    start_up_s = 0.1
     max_zero_deg_s = 20.0  # MPU-6050; 5 of the later ones
 
     def __init__(self, bus: I2cBus, setup: ImuSetup, address: int = ADDRESSES[0]) -> None:
         """Take settings; nothing is sent yet."""
-        self._bus, self.address = bus, address
+        super().__init__(bus, address, "")
         self._divider = divided(setup.rate_hz, _INTERNAL_HZ)
         self.rate_hz = _INTERNAL_HZ / self._divider
         gyro = _GYRO_RANGES[next_of(setup.gyro_range_deg_s, _GYRO_RANGES)]
         accel_g = next_of(setup.accel_range_g, _ACCEL_RANGES)
         self.gyro_rad_s = float(np.deg2rad(1.0 / _LSB_PER_DEG_S[gyro]))
         self.accel_m_s2 = accel_g / 32768.0 * G_M_S2
-        self._is_clone_taken, self.doubt = setup.named == CLONE, ""
-        self._settings = bytes((self._divider - 1, _FILTER, gyro << 3, _ACCEL_RANGES[accel_g] << 3))
-        self._take_id(0x68)
+        self._is_clone_taken = setup.named == CLONE
+        self._kept = bytes((self._divider - 1, _FILTER, gyro << 3, _ACCEL_RANGES[accel_g] << 3))
+        self._take_id(0x68, IDS[0x68])
         self._count = bus.prepare([(address, _INT_STATUS, 1), (address, _FIFO_COUNT, 2)])
         self._pops = bus.prepare([(address, _FIFO_DATA, SAMPLE_BYTES)] * MAX_READS)
         self._watch = bus.prepare([(address, _SMPLRT_DIV, 4), (address, _TEMPERATURE, 2)])
 
-    def _take_id(self, found: int) -> None:
-        if found in CLONE_IDS and self._is_clone_taken:
-            self.name, self.doubt = f"MPU-6050 clone 0x{found:02x}", _DOUBT
-        else:
-            self.name = refuse_other(self._bus, self.address, found, IDS)
+    def _take_id(self, found: int, name: str) -> None:
+        self.name = name
         self._is_first = found == 0x68
         self._fifo_bytes = 1024 if self._is_first else 512
         self.gyro_delay_s, self.accel_delay_s = _DELAYS_S.get(found, _LATER_DELAYS_S)
 
     def configure(self, clock: Clock) -> None:
         """Reset the chip, set it up and start it with an empty FIFO; raises BusError, HardwareError."""
-        self._take_id(self._bus.read(self.address, ID_REGISTER, 1)[0])
-        self._bus.write(self.address, _PWR_MGMT_1, _RESET)
-        clock.sleep_until(clock.now_ns() + round(_RESET_S * 1e9))
-        if self._bus.read(self.address, _PWR_MGMT_1, 1)[0] & _RESET:
-            raise HardwareError(f"{self._bus.path}: the {self.name} does not come out of its reset; check its supply")
-        self._bus.write(self.address, _PWR_MGMT_1, _CLOCK_PLL_X)  # also wakes it up
+        clones = {clone: f"MPU-6050 clone 0x{clone:02x}" for clone in CLONE_IDS if self._is_clone_taken}
+        name, found = self._identified(ID_REGISTER, IDS | clones)
+        self._take_id(found, name)
+        self.doubt = _DOUBT if found in clones else ""
+        self._write(_PWR_MGMT_1, _RESET)
+        self._await_reset(clock, _PWR_MGMT_1, _RESET, _RESET_S)
+        self._write(_PWR_MGMT_1, _CLOCK_PLL_X)  # also wakes it up
         clock.sleep_until(clock.now_ns() + round(_WAKE_S * 1e9))
-        for offset, value in enumerate(self._settings):
-            self._bus.write(self.address, _SMPLRT_DIV + offset, value)
+        self._write(_SMPLRT_DIV, *self._kept)
         if not self._is_first:
-            self._bus.write(self.address, _SMPLRT_DIV + 4, _FILTER)  # the accelerometer has a filter of its own
-        self._bus.write(self.address, _INT_PIN_CFG, _BYPASS)  # a magnetometer behind it comes to the bus
-        self._bus.write(self.address, _INT_ENABLE, _OVERFLOW)  # its status bit is set then
-        self._bus.write(self.address, _FIFO_EN, _GYRO_AND_ACCEL)
+            self._write(_SMPLRT_DIV + 4, _FILTER)  # the accelerometer has a filter of its own
+        self._write(_INT_PIN_CFG, _BYPASS)  # a magnetometer behind it comes to the bus
+        self._write(_INT_ENABLE, _OVERFLOW)  # its status bit is set then
+        self._write(_FIFO_EN, _GYRO_AND_ACCEL)
         self.empty()
 
     def waiting(self) -> Waiting:
-        """Return how many samples wait; after an overflow none, and the FIFO is emptied. Raises BusError.
-
-        Bytes are overwritten one by one then, so that nothing in it begins where a sample does.
-        """
+        """Return how many samples wait, see `FifoImu`."""
         status, high, low = self._count.run()
-        count = high << 8 | low
-        if status & _OVERFLOW or count > self._fifo_bytes - SAMPLE_BYTES:
-            self.empty()
-            return Waiting(0, True)
-        return Waiting(count // SAMPLE_BYTES, False)
+        return self._whole(high << 8 | low, bool(status & _OVERFLOW), self._fifo_bytes, SAMPLE_BYTES)
 
     def take(self, units: int) -> RawSamples:
         """Take `units` samples; raises BusError: then `empty` it."""
-        return decoded(popped(self._pops, units))
+        return decoded(self._popped(units))
 
     def empty(self) -> None:
         """Throw away what the FIFO holds; raises BusError."""
-        self._bus.write(self.address, _USER_CTRL, _FIFO_RESET)
-        self._bus.write(self.address, _USER_CTRL, _FIFO_ON)
+        self._write(_USER_CTRL, _FIFO_RESET)
+        self._write(_USER_CTRL, _FIFO_ON)
 
-    def temperature_c(self) -> float:
-        """Return the chip's temperature; raises BusError, SettingsLostError."""
-        data = self._watch.run()
-        if data[:4] != self._settings:
-            raise SettingsLostError(f"{self.name}: settings {data[:4].hex()}, given {self._settings.hex()}")
-        counts = int.from_bytes(data[4:], "big", signed=True)
+    def _celsius(self, data: bytes) -> float:
+        counts = int.from_bytes(data, "big", signed=True)
         return counts / 340.0 + 36.53 if self._is_first else counts / 333.87 + 21.0
 
     def _trims(self) -> tuple[Array, Array]:
         """Return the responses [3], [3] in LSB that the maker stored for gyro and accelerometer; 0: none."""
-        read = self._bus.read
         if self._is_first:
-            *codes, low = read(self.address, 0x0D, 4)
+            *codes, low = self._read(0x0D, 4)
             gyro = np.array(codes) & 0x1F
             accel = np.array(codes) >> 5 << 2 | low >> np.array([4, 2, 0]) & 3
             of_gyro = np.array([25.0, -25.0, 25.0]) * 131.0 * 1.046 ** (gyro - 1.0)
             of_accel = 4096.0 * 0.34 * (0.92 / 0.34) ** ((accel - 1.0) / 30.0)
         else:
-            gyro, accel = (np.array(list(read(self.address, first, 3))) for first in (0x00, 0x0D))
+            gyro, accel = (np.array(list(self._read(first, 3))) for first in (0x00, 0x0D))
             of_gyro, of_accel = 2620.0 * 1.01 ** (gyro - 1.0), 2620.0 * 1.01 ** (accel - 1.0)
         return np.where(gyro > 0, of_gyro, 0.0), np.where(accel > 0, of_accel, 0.0)
 
@@ -160,14 +142,13 @@ class Mpu6050:
         taken = []
         try:
             for stimulus in (0, _STIMULUS, 0):
-                self._bus.write(self.address, _GYRO_CONFIG, stimulus)  # at 250 deg/s
-                self._bus.write(self.address, _ACCEL_CONFIG, stimulus | accel_range)
+                self._write(_GYRO_CONFIG, stimulus, stimulus | accel_range)  # at 250 deg/s; ACCEL_CONFIG follows
                 taken.append(fresh(self, clock))
         finally:
             try:
-                self._bus.write(self.address, _GYRO_CONFIG, self._settings[2])
+                self._write(_GYRO_CONFIG, self._kept[2])
             finally:
-                self._bus.write(self.address, _ACCEL_CONFIG, self._settings[3])
+                self._write(_ACCEL_CONFIG, self._kept[3])
         self.empty()
         if min(map(len, taken)) < SAMPLES:
             return SelfTest(self.name, None, f"fewer than {SAMPLES} samples came in time", next_step="check its supply")

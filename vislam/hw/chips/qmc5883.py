@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vislam.hw.chips.bus import I2cBus, SettingsLostError
-from vislam.hw.chips.field import FieldReading
-from vislam.hw.chips.self_test import SelfTest
+from vislam.hw.chips.field import FieldReading, Magnetometer
 from vislam.hw.timing import Clock
 
 _UT_PER_GA = 100.0
@@ -44,13 +43,14 @@ QMC5883P = Variant(
 _NARROW_GA = 2.0
 
 
-class Qmc5883:
+class Qmc5883(Magnetometer):
     """One chip of either kind, measuring at 100 Hz."""
 
     rate_hz = 100.0
+    untested = "this chip has no self-test with stated limits"
 
-    def __init__(self, bus: I2cBus, range_ga: float, variant: Variant) -> None:
-        """Take settings; nothing is sent yet."""
+    def __init__(self, variant: Variant, bus: I2cBus, range_ga: float, address: int = 0) -> None:
+        """Take settings; nothing is sent yet. The address is the variant's."""
         self._bus, self._variant = bus, variant
         wide = range_ga > _NARROW_GA
         self._setup = variant.wide if wide else variant.narrow
@@ -77,7 +77,3 @@ class Qmc5883:
             return None
         counts = np.array(struct.unpack_from("<3h", data, 1), dtype=np.float64)
         return FieldReading(counts * (_UT_PER_GA / self._lsb_per_ga), bool(data[0] & _OVERFLOW))
-
-    def self_test(self, clock: Clock) -> SelfTest:
-        """Return that there is none: the field's plausibility is all that can be checked."""
-        return SelfTest(self.name, None, "this chip has no self-test with stated limits")

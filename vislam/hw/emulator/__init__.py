@@ -1,11 +1,10 @@
 """Boards without hardware: virtual chips under the real smbus2, byte for byte, driven by a motion that is known."""
 
 from vislam.hw.emulator.bmi270 import VirtualBmi270
-from vislam.hw.emulator.board import emulated_gy85, gy85_errors
+from vislam.hw.emulator.board import emulated_board, emulated_gy85, gy85_errors
 from vislam.hw.emulator.bridge import BridgeEmulator, LineFaults
 from vislam.hw.emulator.bus import EmulatedBus, emulated_bus
 from vislam.hw.emulator.chips import VirtualAdxl345, VirtualItg3205
-from vislam.hw.emulator.fifo_board import emulated_board
 from vislam.hw.emulator.fifo_chip import FifoChip
 from vislam.hw.emulator.icm20948 import VirtualIcm20948
 from vislam.hw.emulator.lsm6dsox import VirtualLsm6dsox

@@ -117,6 +117,7 @@ class LineFaults:
     no_accel: bool = False  # the chip does not answer
     no_gyro: bool = False
     frozen: bool = False  # the gyro gives the same counts for ever
+    frozen_accel: bool = False
     frozen_mag: bool = False
 
 
@@ -295,10 +296,9 @@ class BridgeEmulator:
         if self.faults.frozen_mag:
             field = (200, -400, 8)
         accel_lsb, most = 1.0 / (hello.accel_nm_s2 * 1e-9), board.accel_most
+        pushed = quantised(accel(force, t_ns, temperature_c, 200.0), accel_lsb, -most - 1, most)
         return RawSample(
-            sequence, t_us, status,
-            quantised(accel(force, t_ns, temperature_c, 200.0), accel_lsb, -most - 1, most), counts,
-            field, temperature,
+            sequence, t_us, status, (1, 2, 250) if self.faults.frozen_accel else pushed, counts, field, temperature,
         )  # fmt: skip
 
     def _waited_until(self, t_ns: int) -> bool:

@@ -34,10 +34,10 @@ class EmulatedBus:
         path: str = "/dev/i2c-emulated",
         smbus_only: bool = False,
         one_read: bool = False,
-        clock: SteppedClock | None = None,
+        stepped: SteppedClock | None = None,
         bus_hz: float = 400_000.0,
     ) -> None:
-        """Take the chips; with a stepped clock, transfers take the time that they need at `bus_hz`.
+        """Take the chips and the device file; a stepped clock is moved on by the time that transfers need at `bus_hz`.
 
         `smbus_only`: no combined messages; `one_read`: a read must be the last of them, as on a Raspberry Pi.
         """
@@ -47,7 +47,7 @@ class EmulatedBus:
         self.is_stuck = False
         self.busy: set[int] = set()
         self.transfers = 0
-        self._smbus_only, self._one_read, self._clock, self._bit_ns = smbus_only, one_read, clock, 1e9 / bus_hz
+        self._smbus_only, self._one_read, self._clock, self._bit_ns = smbus_only, one_read, stepped, 1e9 / bus_hz
         self._is_plugged = True
         self._address = -1
         self._timeout_ns = 1_000_000_000

@@ -19,7 +19,7 @@ from vislam.config import Config, LiveConfig
 from vislam.core.messages import Array, ImuSample, MagSample, NavState, Tracking, VoMeasurement, no_observations
 from vislam.ekf.correction import Correction
 from vislam.hw.health import Health
-from vislam.hw.source import InertialSource
+from vislam.hw.imu_source import InertialSource
 from vislam.imu import AttitudeFilter, BiasMemory, ImuNoise
 from vislam.live.fast import FastPath
 from vislam.live.notices import Start, ToFast

@@ -16,7 +16,8 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array, Frame, ImuSample, MagSample
 from vislam.core.readings import Reading
-from vislam.hw.source import FrameSource, InertialSource, ReadingSource
+from vislam.hw.imu_source import InertialSource
+from vislam.hw.source import FrameSource, ReadingSource
 from vislam.imu import ImuNoise
 from vislam.live.driving.pursuit import PathFollower
 from vislam.live.epoch import Epoch

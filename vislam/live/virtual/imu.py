@@ -13,12 +13,11 @@ from typing import Protocol
 
 from vislam.config import Gy85Config, SensorsConfig
 from vislam.core.errors import HardwareError
-from vislam.core.messages import Array, ImuSample, MagSample
+from vislam.core.messages import ImuSample, MagSample
 from vislam.hw.emulator import BridgeEmulator, LineFaults, SteppedClock, Truth, emulated_bus, emulated_gy85, gy85_errors
 from vislam.hw.gy85 import Gy85
-from vislam.hw.health import Health
+from vislam.hw.imu_source import InertialSource
 from vislam.hw.sensors import open_inertial
-from vislam.hw.source import InertialSource
 from vislam.hw.timing import Clock, HostClock
 from vislam.live.epoch import Epoch
 from vislam.live.processes.child import Life
@@ -41,8 +40,8 @@ class Moved(Protocol):
         ...
 
 
-class VirtualGy85:
-    """Satisfies `InertialSource`; unplugged in each of `outages`."""
+class VirtualGy85(Gy85):
+    """A GY-85 on a cart; unplugged in each of `outages`."""
 
     def __init__(
         self, cart: Moved, begin_ns: Callable[[], int], config: Gy85Config, seed: int, gravity_m_s2: float,
@@ -60,24 +59,13 @@ class VirtualGy85:
             stepped: the clock of a simulation that takes no time; None: that of the host.
         """
         self._begin_ns, self._outages = begin_ns, _Outages(outages)
-        self._clock: Clock = HostClock() if stepped is None else stepped
-        self._stack = ExitStack()
+        clock: Clock = HostClock() if stepped is None else stepped
         truth = _truth(cart, begin_ns, gravity_m_s2)
-        self._board = emulated_gy85(truth, self._clock.now_ns, seed, path=config.bus, stepped=stepped)
+        self._board = emulated_gy85(truth, clock.now_ns, seed, path=config.bus, stepped=stepped)
         self._is_plugged = True
+        self._stack = ExitStack()
         self._stack.enter_context(emulated_bus(self._board))
-        self._driver = Gy85(config, self._clock)
-        self._stack.callback(self._driver.close)
-        self.rate_hz = self._driver.rate_hz
-
-    @property
-    def temperature_c(self) -> float | None:
-        """That of the driver."""
-        return self._driver.temperature_c
-
-    def zeroed_at(self, temperature_c: float, gyro_per_c: Array) -> None:
-        """Pass the zero on to the driver."""
-        self._driver.zeroed_at(temperature_c, gyro_per_c)
+        super().__init__(config, clock)
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what the driver reads."""
@@ -85,18 +73,11 @@ class VirtualGy85:
         if plugged != self._is_plugged:
             self._is_plugged = plugged
             (self._board.replug if plugged else self._board.unplug)()
-        return self._driver.read(timeout_s)
-
-    def health(self) -> Health:
-        """Return that of the driver."""
-        return self._driver.health()
-
-    def counters(self) -> dict[str, int]:
-        """Return those of the driver."""
-        return self._driver.counters()
+        return super().read(timeout_s)
 
     def close(self) -> None:
         """Give the board back."""
+        super().close()
         self._stack.close()
 
 
