@@ -11,7 +11,7 @@ from vislam.core.camera import Camera
 from vislam.core.geometry import invert, se3_exp, se3_log, so3_exp, so3_log
 from vislam.core.messages import Array
 from vislam.frontend.turning_rows import TurningRows
-from vislam.vision.landmarks import UNKNOWN_RHO_SIGMA, Landmarks, fuse, move, predict
+from vislam.vision.landmarks import UNKNOWN_RHO, UNKNOWN_RHO_SIGMA, Landmarks, fuse, move, predict
 from vislam.vision.locate import pnp_ransac
 from vislam.vision.refine import extra_parameter, pose_covariance, refine_pose
 from vislam.vision.shutter import Shutter
@@ -155,6 +155,28 @@ def test_points_of_unknown_depth_constrain_across_their_epipolar_line() -> None:
     estimate = refine_pose(T, landmarks, P, xy, SIGMA, 3.0)
     sigma = np.sqrt(np.diag(estimate.covariance))
     assert estimate.converged and sigma[3] > 10.0 * sigma[4]
+
+
+def test_points_of_unknown_depth_help_those_of_known_depth() -> None:
+    """Points a metre away, more than half of unknown depth, as beyond a depth camera's edges: NEES and error."""
+    rng, nees, errors_m = np.random.default_rng(5), [], []
+    for _ in range(60):
+        landmarks = np.column_stack([scene(rng, 200)[:, :2], rng.uniform(0.6, 1.1, 200)])
+        T = se3_exp(np.concatenate([rng.normal(0.0, 0.02, 3), rng.normal(0.0, 0.06, 3)]))
+        xy = seen_from(landmarks, T)[:, :2] + rng.normal(0.0, 4.0 * SIGMA, (200, 2))
+        is_known = np.arange(200) < 80
+        P = np.tile(np.diag([1e-10, 1e-10, 1.0]), (200, 1, 1))
+        P[:, 2, 2] = np.where(is_known, 0.01, UNKNOWN_RHO_SIGMA) ** 2
+        landmarks[:, 2] = np.where(is_known, landmarks[:, 2] + rng.normal(0.0, 0.01, 200), UNKNOWN_RHO)
+        start = T @ se3_exp(rng.normal(0.0, 0.005, 6))
+        both = [refine_pose(start, landmarks[:n], P[:n], xy[:n], 4.0 * SIGMA, 3.0) for n in (80, 200)]
+        errors = [se3_log(invert(T) @ found.T_key_cam) for found in both]
+        assert all(found.converged for found in both)
+        nees.append(errors[1] @ np.linalg.solve(both[1].covariance, errors[1]) / 6.0)
+        errors_m.append([np.linalg.norm(error[3:]) for error in errors])
+    of_known, of_all = np.sqrt(np.mean(np.square(errors_m), axis=0))
+    assert of_all < of_known
+    assert 0.5 < np.median(nees) < 1.5 and np.mean(nees) < 2.5
 
 
 def test_depth_constrains_where_directions_do_not() -> None:

@@ -14,7 +14,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 
 UNKNOWN_RHO = 0.25  # 1/m: where a point of unknown depth is assumed, four metres away ...
-UNKNOWN_RHO_SIGMA = 0.75  # 1/m: ... or anywhere between a metre and infinity
+UNKNOWN_RHO_SIGMA = 3.0  # 1/m: ... or anywhere else: along its epipolar line it constrains nothing
 _KNOWN_FRACTION = 0.25  # sigma of rho relative to rho
 _KNOWN_FAR = 0.02  # 1/m: sigma below which a point is known to be far, whatever its rho
 _MIN_Z = 0.05  # of a landmark moved into another camera, relative to its old z-depth: nearer is behind or beside

@@ -23,6 +23,8 @@ CHI2_GATE = 13.8  # squared Mahalanobis distance with two degrees of freedom tha
 _CONVERGED = 1e-6  # norm of the step in rad and m: a thousandth of a pixel
 _SETTLED = 1e-3  # a step that still matters after the last iteration
 _MAX_ITERATIONS = 20
+_CONTRADICTED = 9.0  # squared sigmas by which a landmark is not at its mean
+_CLOSING = 0.7  # of the kernel's width from one step to the next, at least
 _GROUPS = 4  # the image plane is cut into 4 x 4 regions whose residuals may err together
 
 
@@ -195,11 +197,11 @@ def _refine(
 ) -> tuple[Array, Array, Array, float, float, bool]:
     no_slope = np.zeros((len(seen.landmarks), 2))
     r, A, chi2 = _whitened(T, seen, no_slope)
-    H, b, variance, size = np.zeros((6, 6)), np.zeros(6), np.nan, np.inf
+    H, b, variance, size, scale = np.zeros((6, 6)), np.zeros(6), np.nan, np.inf, np.inf
     for iteration in range(_MAX_ITERATIONS + 1):
-        # far from the answer every residual is an outlier: the kernel starts as wide as they are and closes with them
+        # far from the answer every residual is an outlier: the kernel starts as wide as they are and closes
         last = iteration == _MAX_ITERATIONS or size < _CONVERGED
-        scale = cauchy if last else max(cauchy, 1.5 * np.sqrt(_median(chi2)))
+        scale = cauchy if last else max(cauchy, min(1.5 * np.sqrt(_median(chi2)), _CLOSING * scale))
         full, gradient, variance = _normal_equations(r, A, chi2, seen.share, scale)
         H, b = full[:6, :6].copy(), gradient[:6].copy()
         if rotation_only:
@@ -228,7 +230,7 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
     R_back, t_back = T_back[:3, :3].copy(), T_back[:3, 3].copy()
     r, A = np.zeros((len(landmarks), 3)), np.zeros((len(landmarks), 3, 7))
     chi2 = np.full(len(landmarks), np.nan)
-    h, J, J_pose, S = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
+    h, J, J_pose, S, moved = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
     for i in range(len(landmarks)):
         if not np.isfinite(measured[i, 0]):
             continue
@@ -239,6 +241,13 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
         elif not predict(landmarks[i], R, t, h, J, J_pose):
             continue
         sandwich(J, seen.covariances[i], S)
+        if _likeliest(landmarks[i], seen.covariances[i], h, J, S, measured[i], sigma[i], moved):
+            if predict(landmarks[i] + moved, R, t, h, J, J_pose):
+                for k in range(3):
+                    h[k] -= J[k, 0] * moved[0] + J[k, 1] * moved[1] + J[k, 2] * moved[2]
+            elif not predict(landmarks[i], R, t, h, J, J_pose):
+                continue
+            sandwich(J, seen.covariances[i], S)
         for k in range(3):
             S[k, k] += sigma[i, k] * sigma[i, k]
         # lower triangular L with L L^T = S[:2, :2], and its inverse applied to residual and Jacobian
@@ -257,6 +266,30 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
             r[i, 2] = (h[2] - measured[i, 2]) / l22
             A[i, 2, :6] = J_pose[2] / l22
     return r, A, chi2
+
+
+@njit(cache=True, nogil=True)
+def _likeliest(
+    landmark: Array, covariance: Array, h: Array, J: Array, S: Array, measured: Array, sigma: Array, moved: Array
+) -> bool:
+    """Fill `moved` [3] with how far from its mean a landmark is likeliest, given where it is seen by this pose.
+
+    There its Jacobian by the pose is that of the joint problem of pose and landmarks (as in an iterated Kalman filter).
+    At the mean of a depth that is hardly known it is too small by a factor: steps then lead away from the answer.
+    False where the landmark would not be in front of the keyframe, or its depth is known.
+    """
+    s00, s01, s11 = S[0, 0] + sigma[0] * sigma[0], S[0, 1], S[1, 1] + sigma[1] * sigma[1]
+    e0, e1 = h[0] - measured[0], h[1] - measured[1]
+    det = s00 * s11 - s01 * s01
+    g0, g1 = (s11 * e0 - s01 * e1) / det, (s00 * e1 - s01 * e0) / det
+    v0, v1 = 0.0, 0.0
+    for a in range(3):
+        moved[a] = 0.0
+        for b in range(3):
+            moved[a] -= covariance[a, b] * (J[0, b] * g0 + J[1, b] * g1)
+        v0, v1 = v0 + covariance[2, a] * J[0, a], v1 + covariance[2, a] * J[1, a]
+    left = covariance[2, 2] - (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / det
+    return landmark[2] + moved[2] > 0.0 and moved[2] * moved[2] > _CONTRADICTED * left
 
 
 @njit(cache=True, nogil=True)
