@@ -23,7 +23,9 @@ CHI2_GATE = 13.8  # squared Mahalanobis distance with two degrees of freedom tha
 _CONVERGED = 1e-6  # norm of the step in rad and m: a thousandth of a pixel
 _SETTLED = 1e-3  # a step that still matters after the last iteration
 _MAX_ITERATIONS = 20
-_CONTRADICTED = 9.0  # squared sigmas by which a landmark is not at its mean
+_BY_NOISE = 3.0  # squared sigmas by which a landmark is off its mean where it moves by half of that
+_BY_FALSE = 55.0  # chi-square at which a track is rather false, and its landmark moves by half
+_NEAREST_INFINITY = 0.99  # of its inverse depth that a landmark loses at most
 _CLOSING = 0.7  # of the kernel's width from one step to the next, at least
 _GROUPS = 4  # the image plane is cut into 4 x 4 regions whose residuals may err together
 
@@ -198,6 +200,7 @@ def _refine(
     no_slope = np.zeros((len(seen.landmarks), 2))
     r, A, chi2 = _whitened(T, seen, no_slope)
     H, b, variance, size, scale = np.zeros((6, 6)), np.zeros(6), np.nan, np.inf, np.inf
+    step, part = np.zeros(6), 1.0
     for iteration in range(_MAX_ITERATIONS + 1):
         # far from the answer every residual is an outlier: the kernel starts as wide as they are and closes
         last = iteration == _MAX_ITERATIONS or size < _CONVERGED
@@ -210,8 +213,9 @@ def _refine(
             return T, H, chi2, np.nan, np.nan, False
         if last:
             break
-        step = np.linalg.solve(H, -b)
-        T = T @ se3_exp(step)
+        before, step = step, np.linalg.solve(H, -b)
+        part = 0.5 * part if np.sum(step * before) < 0.0 else min(2.0 * part, 1.0)  # there and back again: half the way
+        T = T @ se3_exp(part * step)
         size = np.sqrt(np.sum(step * step))
         r, A, chi2 = _whitened(T, seen, no_slope)
     together = 1.0 if rotation_only else _common_error(H, r, A, chi2, seen.measured, cauchy)
@@ -241,7 +245,7 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
         elif not predict(landmarks[i], R, t, h, J, J_pose):
             continue
         sandwich(J, seen.covariances[i], S)
-        if _likeliest(landmarks[i], seen.covariances[i], h, J, S, measured[i], sigma[i], moved):
+        if _towards_likeliest(landmarks[i], seen.covariances[i], h, J, S, measured[i], sigma[i], moved):
             if predict(landmarks[i] + moved, R, t, h, J, J_pose):
                 for k in range(3):
                     h[k] -= J[k, 0] * moved[0] + J[k, 1] * moved[1] + J[k, 2] * moved[2]
@@ -269,14 +273,16 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
 
 
 @njit(cache=True, nogil=True)
-def _likeliest(
+def _towards_likeliest(
     landmark: Array, covariance: Array, h: Array, J: Array, S: Array, measured: Array, sigma: Array, moved: Array
 ) -> bool:
-    """Fill `moved` [3] with how far from its mean a landmark is likeliest, given where it is seen by this pose.
+    """Fill `moved` [3] with how far from its mean a landmark is taken, given where it is seen by the pose at hand.
 
-    There its Jacobian by the pose is that of the joint problem of pose and landmarks (as in an iterated Kalman filter).
-    At the mean of a depth that is hardly known it is too small by a factor: steps then lead away from the answer.
-    False where the landmark would not be in front of the keyframe, or its depth is known.
+    Where it is likeliest its Jacobian by the pose is that of the joint problem of pose and landmarks (as in an iterated
+    Kalman filter). At the mean of a depth that is hardly known it is off by a factor: steps then lead away from the
+    answer. What noise alone explains is left at the mean, since Jacobians that follow noise are biased, and so is what a
+    false track explains; in between the landmark moves by a part, as steps would not settle if it jumped. Return
+    whether it moves.
     """
     s00, s01, s11 = S[0, 0] + sigma[0] * sigma[0], S[0, 1], S[1, 1] + sigma[1] * sigma[1]
     e0, e1 = h[0] - measured[0], h[1] - measured[1]
@@ -289,7 +295,16 @@ def _likeliest(
             moved[a] -= covariance[a, b] * (J[0, b] * g0 + J[1, b] * g1)
         v0, v1 = v0 + covariance[2, a] * J[0, a], v1 + covariance[2, a] * J[1, a]
     left = covariance[2, 2] - (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / det
-    return landmark[2] + moved[2] > 0.0 and moved[2] * moved[2] > _CONTRADICTED * left
+    square = moved[2] * moved[2]
+    if not (square > 0.0 and landmark[2] > 0.0):
+        return False
+    part = square / (square + _BY_NOISE * max(left, 0.0)) / (1.0 + (e0 * g0 + e1 * g1) / _BY_FALSE)
+    part = min(part, np.sqrt(covariance[2, 2] / square))
+    if moved[2] < 0.0:  # it stays in front of the keyframe
+        part = min(part, -_NEAREST_INFINITY * landmark[2] / moved[2])
+    for a in range(3):
+        moved[a] *= part
+    return True
 
 
 @njit(cache=True, nogil=True)
