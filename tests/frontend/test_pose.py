@@ -175,8 +175,8 @@ def test_points_of_unknown_depth_help_those_of_known_depth() -> None:
         nees.append(errors[1] @ np.linalg.solve(both[1].covariance, errors[1]) / 6.0)
         errors_m.append([np.linalg.norm(error[3:]) for error in errors])
     of_known, of_all = np.sqrt(np.mean(np.square(errors_m), axis=0))
-    assert of_all < of_known
-    assert 0.5 < np.median(nees) < 1.5 and np.mean(nees) < 2.5
+    assert of_all < 0.95 * of_known
+    assert 0.5 < np.mean(nees) < 1.5
 
 
 def test_depth_constrains_where_directions_do_not() -> None:

@@ -14,7 +14,7 @@ from vislam.core.jit import njit
 from vislam.core.messages import Array
 
 UNKNOWN_RHO = 0.25  # 1/m: where a point of unknown depth is assumed, four metres away ...
-UNKNOWN_RHO_SIGMA = 3.0  # 1/m: ... or anywhere else: along its epipolar line it constrains nothing
+UNKNOWN_RHO_SIGMA = 0.75  # 1/m: ... or anywhere between a metre and infinity
 _KNOWN_FRACTION = 0.25  # sigma of rho relative to rho
 _KNOWN_FAR = 0.02  # 1/m: sigma below which a point is known to be far, whatever its rho
 _MIN_Z = 0.05  # of a landmark moved into another camera, relative to its old z-depth: nearer is behind or beside
@@ -141,6 +141,12 @@ def metric_points(inverse_depth: Array) -> Array:
     return np.column_stack([inverse_depth[:, :2], np.ones(len(inverse_depth))]) / inverse_depth[:, 2:]
 
 
+def known_depth(landmarks: Array, covariances: Array) -> NDArray[np.bool_]:
+    """Return which landmarks [N, 3] with covariances [N, 3, 3] have a depth that is good enough to stand on."""
+    sigma = np.sqrt(covariances[:, 2, 2])
+    return np.asarray(sigma < np.maximum(_KNOWN_FRACTION * landmarks[:, 2], _KNOWN_FAR), dtype=np.bool_)
+
+
 class Landmarks:
     """The landmarks of the tracks, row by row: means [N, 3] and covariances [N, 3, 3]."""
 
@@ -156,8 +162,7 @@ class Landmarks:
     @property
     def known(self) -> NDArray[np.bool_]:
         """Which landmarks [N] have a depth that is good enough to stand on."""
-        sigma = np.sqrt(self.covariance[:, 2, 2])
-        return np.asarray(sigma < np.maximum(_KNOWN_FRACTION * self.mean[:, 2], _KNOWN_FAR), dtype=np.bool_)
+        return known_depth(self.mean, self.covariance)
 
     def keep(self, which: NDArray[np.bool_]) -> None:
         """Drop the rows that are not in `which` [N]."""

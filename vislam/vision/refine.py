@@ -1,9 +1,11 @@
 """Pose of a camera against inverse-depth landmarks: robust Gauss-Newton with the uncertainty of both sides.
 
 The covariance of a residual is that of the measurement plus the landmark's own, carried through the projection; so a
-point of poor depth still helps where its depth does not matter. Depth that the current frame measures has a kernel of
-its own: on fr1_desk, where depth and colour are exposed at different times, one kernel for all three components tripled
-the error, while two kernels halve it where the features lie in one strip of the image.
+point of poor depth still helps where its depth does not matter. One of unknown depth is guessed as far away as those
+around: its Jacobian by the pose is that of the guess; where that is off by a factor, steps lead away from the answer.
+Depth that the current frame measures has a kernel of its own: on fr1_desk, where depth and colour are exposed at
+different times, one kernel for all three components tripled the error, while two kernels halve it where the features
+lie in one strip of the image.
 """
 
 from __future__ import annotations
@@ -17,16 +19,14 @@ from numpy.typing import NDArray
 from vislam.core.geometry import invert, se3_adjoint, se3_exp
 from vislam.core.jit import njit
 from vislam.core.messages import Array
-from vislam.vision.landmarks import predict, sandwich
+from vislam.vision.landmarks import UNKNOWN_RHO_SIGMA, known_depth, predict, sandwich
 
 CHI2_GATE = 13.8  # squared Mahalanobis distance with two degrees of freedom that one good residual in 1000 exceeds
 _CONVERGED = 1e-6  # norm of the step in rad and m: a thousandth of a pixel
 _SETTLED = 1e-3  # a step that still matters after the last iteration
 _MAX_ITERATIONS = 20
-_BY_NOISE = 3.0  # squared sigmas by which a landmark is off its mean where it moves by half of that
-_BY_FALSE = 55.0  # chi-square at which a track is rather false, and its landmark moves by half
-_NEAREST_INFINITY = 0.99  # of its inverse depth that a landmark loses at most
 _CLOSING = 0.7  # of the kernel's width from one step to the next, at least
+_ENOUGH_KNOWN = 30  # points whose depth is known, for a guess of the others'
 _GROUPS = 4  # the image plane is cut into 4 x 4 regions whose residuals may err together
 
 
@@ -190,6 +190,10 @@ def _sightings(
     measured = np.column_stack([xy, np.full(len(xy), np.nan) if rho is None else rho])
     sigma = np.column_stack([np.full((len(xy), 2), sigma_xy), np.ones(len(xy)) if sigma_rho is None else sigma_rho])
     share, is_back = np.ones(len(xy)), np.zeros(len(xy), dtype=np.bool_)
+    guessed = covariances[:, 2, 2] >= 0.999 * UNKNOWN_RHO_SIGMA**2
+    known_rho = landmarks[known_depth(landmarks, covariances) & np.isfinite(xy[:, 0]), 2]
+    if len(known_rho) >= _ENOUGH_KNOWN:
+        landmarks = np.column_stack([landmarks[:, :2], np.where(guessed, np.median(known_rho), landmarks[:, 2])])
     return _Sightings(landmarks, covariances, measured, sigma, share, is_back)
 
 
@@ -234,7 +238,7 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
     R_back, t_back = T_back[:3, :3].copy(), T_back[:3, 3].copy()
     r, A = np.zeros((len(landmarks), 3)), np.zeros((len(landmarks), 3, 7))
     chi2 = np.full(len(landmarks), np.nan)
-    h, J, J_pose, S, moved = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3)), np.empty(3)
+    h, J, J_pose, S = np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     for i in range(len(landmarks)):
         if not np.isfinite(measured[i, 0]):
             continue
@@ -245,13 +249,6 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
         elif not predict(landmarks[i], R, t, h, J, J_pose):
             continue
         sandwich(J, seen.covariances[i], S)
-        if _towards_likeliest(landmarks[i], seen.covariances[i], h, J, S, measured[i], sigma[i], moved):
-            if predict(landmarks[i] + moved, R, t, h, J, J_pose):
-                for k in range(3):
-                    h[k] -= J[k, 0] * moved[0] + J[k, 1] * moved[1] + J[k, 2] * moved[2]
-            elif not predict(landmarks[i], R, t, h, J, J_pose):
-                continue
-            sandwich(J, seen.covariances[i], S)
         for k in range(3):
             S[k, k] += sigma[i, k] * sigma[i, k]
         # lower triangular L with L L^T = S[:2, :2], and its inverse applied to residual and Jacobian
@@ -270,41 +267,6 @@ def _whitened(T: Array, seen: _Sightings, slope: Array) -> tuple[Array, Array, A
             r[i, 2] = (h[2] - measured[i, 2]) / l22
             A[i, 2, :6] = J_pose[2] / l22
     return r, A, chi2
-
-
-@njit(cache=True, nogil=True)
-def _towards_likeliest(
-    landmark: Array, covariance: Array, h: Array, J: Array, S: Array, measured: Array, sigma: Array, moved: Array
-) -> bool:
-    """Fill `moved` [3] with how far from its mean a landmark is taken, given where it is seen by the pose at hand.
-
-    Where it is likeliest its Jacobian by the pose is that of the joint problem of pose and landmarks (as in an iterated
-    Kalman filter). At the mean of a depth that is hardly known it is off by a factor: steps then lead away from the
-    answer. What noise alone explains is left at the mean, since Jacobians that follow noise are biased, and so is what a
-    false track explains; in between the landmark moves by a part, as steps would not settle if it jumped. Return
-    whether it moves.
-    """
-    s00, s01, s11 = S[0, 0] + sigma[0] * sigma[0], S[0, 1], S[1, 1] + sigma[1] * sigma[1]
-    e0, e1 = h[0] - measured[0], h[1] - measured[1]
-    det = s00 * s11 - s01 * s01
-    g0, g1 = (s11 * e0 - s01 * e1) / det, (s00 * e1 - s01 * e0) / det
-    v0, v1 = 0.0, 0.0
-    for a in range(3):
-        moved[a] = 0.0
-        for b in range(3):
-            moved[a] -= covariance[a, b] * (J[0, b] * g0 + J[1, b] * g1)
-        v0, v1 = v0 + covariance[2, a] * J[0, a], v1 + covariance[2, a] * J[1, a]
-    left = covariance[2, 2] - (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / det
-    square = moved[2] * moved[2]
-    if not (square > 0.0 and landmark[2] > 0.0):
-        return False
-    part = square / (square + _BY_NOISE * max(left, 0.0)) / (1.0 + (e0 * g0 + e1 * g1) / _BY_FALSE)
-    part = min(part, np.sqrt(covariance[2, 2] / square))
-    if moved[2] < 0.0:  # it stays in front of the keyframe
-        part = min(part, -_NEAREST_INFINITY * landmark[2] / moved[2])
-    for a in range(3):
-        moved[a] *= part
-    return True
 
 
 @njit(cache=True, nogil=True)
