@@ -2,7 +2,7 @@
 
     python examples/14_masks.py
 
-A person in patterned clothes walks to and fro before a camera with depth and fills 40 % of its image. With masks, as a
+A person in patterned clothes walks to and fro before a camera with depth and fills 60 % of its image. With masks, as a
 network gives them, neither the motion nor the map follows the person. Zero stands for what is not used, 255 for the
 rest.
 """
@@ -15,7 +15,7 @@ from vislam import Config, Slam, open_source
 from vislam.core import Array, Frame, MaskedRecording, Recording
 from vislam.trajectory import Trajectory, evaluate
 
-WORLD = "sim:handheld-room,duration_s=6,camera_hz=10,image_width_px=320,moving_share=0.4,moving_begin_s=1.5"
+WORLD = "sim:handheld-room,duration_s=6,camera_hz=10,image_width_px=320,moving_share=0.6,moving_begin_s=1.5"
 PERSON_M = 2.0  # away from the camera, nearer than most of the room
 
 
