@@ -23,7 +23,14 @@ IMAGE = np.random.default_rng(0).integers(0, 255, SIZE).astype(np.uint8)
 LEFT = np.full(SIZE, 255, np.uint8)
 LEFT[:, CAMERA.width // 2 :] = 0
 NONE = np.empty((0, 2))
-WALK = {"duration_s": 6.0, "camera_hz": 10.0, "image_width_px": 320, "moving_share": 0.4, "moving_begin_s": 1.5}
+WALK = {
+    "duration_s": 6.0,
+    "camera_hz": 10.0,
+    "image_width_px": 320,
+    "moving_share": 0.4,
+    "moving_begin_s": 1.5,
+    "seed": 1,
+}
 
 
 def write(path, mask):

@@ -26,7 +26,7 @@ _CONVERGED = 1e-6  # norm of the step in rad and m: a thousandth of a pixel
 _SETTLED = 1e-3  # a step that still matters after the last iteration
 _MAX_ITERATIONS = 20
 _CLOSING = 0.7  # of the kernel's width from one step to the next, at least
-_ENOUGH_KNOWN = 30  # points whose depth is known, for a guess of the others'
+_ENOUGH_KNOWN = 60  # points whose depth is known, for a guess of the others'
 _GROUPS = 4  # the image plane is cut into 4 x 4 regions whose residuals may err together
 
 
