@@ -92,9 +92,7 @@ def test_a_place_that_is_found_is_in_map_at_once_and_no_pose_is_claimed_before(t
     """By vision alone, from another place; vision is lost once, and the submap after it is found in the map as well."""
     with_depth = "points:corridor-loop,rig=rgbd,tracks=150"  # with one end both have the same landmarks
     sources = [f"{with_depth},duration_s=12,camera_hz=10"]
-    sources += [
-        f"{with_depth},start_s=1.5,duration_s=10.5,camera_hz=12,pixel_sigma_px=0.8,outage_begin_s=5,outage_length_s=0.5"
-    ]
+    sources += [f"{with_depth},start_s=1.5,duration_s=10.5,camera_hz=12,pixel_sigma_px=0.8"]
     by_eye = {"imu.enabled": False, "map.enabled": False}
     old, new = tmp_path / "old", tmp_path / "new"
     run(sources[0], old, **by_eye)
