@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vislam.core.jit import njit
 from vislam.core.messages import Array
 
-UNKNOWN_RHO = 0.25  # 1/m: where a point of unknown depth is assumed, four metres away ...
+UNKNOWN_RHO = 0.25  # 1/m: of a point of unknown depth beside few known ones (`refine.py`), four metres away ...
 UNKNOWN_RHO_SIGMA = 0.75  # 1/m: ... or anywhere between a metre and infinity
 _KNOWN_FRACTION = 0.25  # sigma of rho relative to rho
 _KNOWN_FAR = 0.02  # 1/m: sigma below which a point is known to be far, whatever its rho
