@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 import psutil
 import pytest
+from live_runs import is_of_a_run
 from numba import njit
 
 from vislam.cli import run_verb
@@ -63,7 +64,7 @@ def test_a_run_is_told_of_and_ended_from_the_page_and_outlives_it(station: Stati
     assert ask(station, "POST", "/command", {"do": "stop"})[0] == 202
     wait_for(lambda: (station.follow(run), run.stopped)[1] == 1)
 
-    pages = [p for p in psutil.Process().children() if "spawn_main" in " ".join(p.cmdline())]
+    pages = [p for p in psutil.Process().children(recursive=True) if is_of_a_run(p)]
     assert len(pages) == 1
     pages[0].kill()
     monkeypatch.setattr("vislam.live.web.station._SHOW_S", 0.0)
