@@ -1,4 +1,4 @@
-"""What is replaced in numba: cached kernels have no LLVM module until one inlines them; a switch undoes it."""
+"""What is replaced in numba: how cached kernels are read, compiled and linked; a switch undoes it."""
 
 import ast
 import hashlib
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from numba.core import codegen
+from numba.core import caching, codegen
 from numba.np import arrayobj
 
 MODULE = """
@@ -98,9 +98,84 @@ def test_the_switch_leaves_numba_as_it_is(folder: Path, monkeypatch: pytest.Monk
     assert _ask(folder, script) == ["1.5", "1", "False"]
 
 
+LONG = """
+import numpy as np
+from vislam.core.jit import njit
+
+@njit(cache=True)
+def long(a, b):
+    return a @ b + b @ a.T - np.linalg.inv(a) @ (b * b)
+
+@njit(cache=True)
+def outer(a, b):
+    c = a.copy()
+    for k in range(3):
+        c = long(c, b) / (1.0 + k)
+    return c
+"""
+
+
+def test_what_is_too_long_to_be_inlined_is_linked_as_it_is_with_the_same_answer(folder: Path, monkeypatch) -> None:
+    (folder / "kernels.py").write_text(LONG)
+    script = """
+import kernels, numpy as np
+rows = np.random.default_rng(3).normal(size=(2, 4, 4))
+print(kernels.outer(*rows).tobytes().hex(), sum(kernels.outer.stats.cache_hits.values()), end=" ")
+library = kernels.outer.overloads[kernels.outer.signatures[0]].library
+print(len(vars(library).get("_long", ())))
+"""
+    answer, hits, long = _ask(folder, script)
+    assert (hits, int(long) > 0) == ("0", True)
+    assert _ask(folder, script)[:2] == [answer, "1"]
+    monkeypatch.setenv("VISLAM_PLAIN_NUMBA", "1")
+    assert _ask(folder, script) == [answer, "0", "0"]
+
+
+STORE_WHEN_ASKED = """
+import sys, kernels
+from numba.core.caching import FunctionCache
+store = FunctionCache.save_overload
+def when_asked(cache, sig, data):
+    print("compiled", flush=True)
+    sys.stdin.readline()
+    store(cache, sig, data)
+FunctionCache.save_overload = when_asked
+print(kernels.half(3.0), sum(kernels.half.stats.cache_hits.values()))
+"""
+SAY_WHEN_WAITING = """
+import kernels, time
+from vislam.core import compiling_turns
+sleep = time.sleep
+def waits(seconds):
+    print("waits", flush=True)
+    compiling_turns.time.sleep = sleep
+compiling_turns.time.sleep = waits
+print(kernels.half(3.0), sum(kernels.half.stats.cache_hits.values()))
+"""
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_one_process_compiles_a_kernel_and_others_wait_while_it_lives(folder: Path, is_killed: bool) -> None:
+    command = [sys.executable, "-c"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "cwd": folder}
+    with subprocess.Popen([*command, STORE_WHEN_ASKED], **pipes) as first:
+        assert first.stdout.readline() == "compiled\n"
+        with subprocess.Popen([*command, SAY_WHEN_WAITING], **pipes) as second:
+            assert second.stdout.readline() == "waits\n"
+            if is_killed:
+                first.kill()
+            first.communicate(None if is_killed else "store it\n")
+            assert second.communicate()[0] == f"1.5 {int(not is_killed)}\n"
+    assert list(folder.rglob("*.compiling")) == []
+
+
 REPLACED = {  # SHA-256 of their code in numba 0.68, without comments and docstrings
     "_unserialize": "161c0d9a4935aa36",
     "_get_module_for_linking": "5053a3ac7254fae6",
+    "_optimize_final_module": "cb25120c79416d2d",
+    "finalize": "38cb6017abb70450",
+    "load_overload": "4dfd0465282fc086",
+    "save_overload": "dbc23ab2657aaa5a",
     "raise_with_shape_context": "1ae016537751aef6",
 }
 
@@ -108,7 +183,7 @@ REPLACED = {  # SHA-256 of their code in numba 0.68, without comments and docstr
 @pytest.mark.parametrize("name", REPLACED)
 def test_what_is_replaced_means_what_it_meant(name: str) -> None:
     """Read what a new numba does there before its hash is written here and its version allowed in pyproject.toml."""
-    sources = (inspect.getsource(module) for module in (codegen, arrayobj))
+    sources = (inspect.getsource(module) for module in (codegen, arrayobj, caching))
     functions = [
         n for s in sources for n in ast.walk(ast.parse(s)) if isinstance(n, ast.FunctionDef) and n.name == name
     ]

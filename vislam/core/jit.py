@@ -13,7 +13,7 @@ from typing import Any
 import numba
 from numba.core import config, event
 
-from vislam.core.numba_internals import replace_internals, stamp_with_callees
+from vislam.core.numba_internals import cache_with_callees, replace_internals
 
 
 def njit(**options: Any) -> Any:
@@ -22,7 +22,7 @@ def njit(**options: Any) -> Any:
 
     def compiled(function: Callable[..., Any]) -> Any:
         kernel = decorate(function)
-        stamp_with_callees(kernel)
+        cache_with_callees(kernel)
         return kernel
 
     return compiled

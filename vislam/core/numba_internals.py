@@ -3,7 +3,9 @@
 Kernels come back from the cache as machine code alone; numba reads their LLVM modules at once, which for the kernels of
 one run takes 40 MB and a third of a second, though only a kernel that inlines them and has to be compiled needs them.
 An assignment to a slice raises a constant text: numba 0.68 puts the shapes into it, for which it compiles its strings
-into every such kernel, a quarter of the time. Results are the same bytes with and without.
+into every such kernel, a quarter of the time. A kernel is linked with what it calls before it is optimised, as a whole
+and once more for each that calls it in turn; what is too long to be inlined joins here as it is, after that: a sixth of
+the time. Results are the same bytes with and without.
 
 A cached kernel is compiled again where a kernel that it calls, or a constant that either reads, has changed: numba
 looks at the kernel's own file alone, and would go on with the old code of another.
@@ -12,6 +14,7 @@ looks at the kernel's own file alone, and would go on with the old code of anoth
 import os
 from collections.abc import Iterator
 from functools import cache
+from itertools import islice
 from types import CodeType, FunctionType
 from typing import Any
 
@@ -22,8 +25,14 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import overload
 from numba.np import arrayobj
 
+from vislam.core.compiling_turns import CacheInTurns
+
+_INLINED = 300  # instructions at most, of what a kernel calls; LLVM's own bound is lower
+
 _read_both = getattr(codegen.CPUCodeLibrary, "_unserialize", None)
 _module_for_linking = getattr(codegen.CPUCodeLibrary, "_get_module_for_linking", None)
+_finalize = codegen.CPUCodeLibrary.finalize
+_optimise = getattr(codegen.CPUCodeLibrary, "_optimize_final_module", None)
 
 
 def replace_internals() -> None:
@@ -35,14 +44,22 @@ def replace_internals() -> None:
     if _read_both is not None and _module_for_linking is not None and hasattr(llvm, "ObjectFileRef"):
         codegen.CPUCodeLibrary._unserialize = classmethod(_read_code)
         codegen.CPUCodeLibrary._get_module_for_linking = _module_when_asked
+    if _optimise is not None and hasattr(codegen.CPUCodeLibrary, "add_linking_library"):
+        codegen.CPUCodeLibrary.finalize = _finalize_with_short
+        codegen.CPUCodeLibrary._optimize_final_module = _optimise_and_link_long
 
 
-def stamp_with_callees(kernel: Any) -> None:
-    """Let what is cached of a kernel hold for what it calls and reads, too, as that is at the kernel's first call."""
-    file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+def cache_with_callees(kernel: Any) -> None:
+    """Let what is cached of a kernel hold for what it calls and reads, too, as that is at the kernel's first call.
+
+    And let one process at a time compile it.
+    """
+    cache = getattr(kernel, "_cache", None)
+    file = getattr(cache, "_cache_file", None)
     if isinstance(file, caching.IndexDataCacheFile) and "_source_stamp" in vars(file) and not _is_plain():
         file.kernel = kernel
         file.__class__ = _WithCallees
+        cache.__class__ = CacheInTurns
 
 
 class _WithCallees(caching.IndexDataCacheFile):  # type: ignore[misc]
@@ -126,3 +143,27 @@ def _module_when_asked(library: Any) -> Any:
     if library._shared_module is None and hasattr(library, "_bitcode"):
         library._shared_module = llvm.parse_bitcode(library._bitcode)
     return _module_for_linking(library)  # type: ignore[misc]
+
+
+def _finalize_with_short(library: Any) -> None:
+    """Finalise a library that is linked at first with the short ones only."""
+    called = dict.fromkeys(library._linking_libraries)
+    library._long = [one for one in called if _is_long(one)]
+    library._linking_libraries = [one for one in called if one not in library._long]
+    _finalize(library)
+
+
+def _optimise_and_link_long(library: Any) -> None:
+    _optimise(library)  # type: ignore[misc]
+    for one in library._long:
+        library._reload_init.update(one._reload_init)
+        library._final_module.link_in(one._get_module_for_linking(), preserve=True)
+
+
+def _is_long(library: Any) -> bool:
+    """Whether a finalised library has more instructions than are worth inlining."""
+    if not hasattr(library, "_is_long"):
+        functions = library._get_module_for_linking().functions
+        every = (i for function in functions for block in function.blocks for i in block.instructions)
+        library._is_long = next(islice(every, _INLINED, None), None) is not None
+    return bool(library._is_long)
