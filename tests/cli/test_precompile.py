@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -83,3 +84,18 @@ def test_a_child_says_nothing_but_names_of_kernels(tmp_path: Path, monkeypatch: 
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (3, "", "")
+
+
+@pytest.mark.parametrize("verb", ["live", "drive"])
+def test_what_runs_in_processes_compiles_before_they_begin(verb: str, tmp_path, monkeypatch) -> None:
+    class Asked(Exception):
+        pass
+
+    def ask(jobs: tuple[str, ...]) -> None:
+        raise Asked(jobs)
+
+    main = import_module(f"vislam.cli.verbs.{verb}")
+    monkeypatch.setattr(main, "compile_ahead", ask)
+    options = {"live": ["--source", "virtual-cart"], "drive": ["--goal", "0", "0", "0", "--real-time"]}[verb]
+    with pytest.raises(Asked, match="live"):
+        main.main([*options, "--out", str(tmp_path / "run")])

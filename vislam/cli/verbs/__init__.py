@@ -66,6 +66,7 @@ _VERBS = {
     "drive": Verb(
         "drive the virtual cart to goals, on the published pose and the map as it grows",
         "vislam drive --goal 2 0 90 --goal 0.5 0.2 180 --out runs/hall",
+        (*_DEMO, "live"),
     ),
     "report": Verb("write report.html of a run again", "vislam report runs/desk"),
     "export": Verb(

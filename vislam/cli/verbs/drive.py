@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vislam.cli.verbs import VERBS
+from vislam.cli.verbs.ahead import compile_ahead
 from vislam.cli.verbs.arguments import parse, take_option, take_path
 from vislam.cli.verbs.brief import COMMON, Brief
 from vislam.cli.verbs.terminal import rewritten_line
@@ -93,7 +95,10 @@ def main(arguments: list[str]) -> int:
 
     goals = [Goal(x, y, math.radians(heading)) for x, y, heading in options.goal]
     limits = Limits(options.speed_m_s, math.radians(options.turn_deg_s))
-    go = _in_real_time if options.real_time or options.listen else _in_lock_step
+    go = _in_lock_step
+    if options.real_time or options.listen:
+        go = _in_real_time
+        compile_ahead(VERBS["drive"].compiles)  # while the cart drives, its processes would stop for it
     arrivals = go(options, f"{_SEES},{rest}", goals, limits, command)
     if not options.json:
         print(f"report: {options.out / 'report.html'}")
