@@ -28,8 +28,14 @@ def sample(t_s):
     return np.concatenate([[W[2, 1], W[0, 2], W[1, 0]], R.T @ (accel + GRAVITY)])
 
 
-def watched(change, until_s=8.0, turned=lambda t_s: 0.0, outliers=lambda t_s: 0.05, is_metric=True):
-    """Yield the witness after each frame; samples are changed by `change(t_s, six)`, vision is turned by rad."""
+def watched(
+    change, until_s=8.0, turned=lambda t_s: 0.0, outliers=lambda t_s: 0.05, is_metric=True, way_m=lambda t_s: 2e-3,
+    stated_m=lambda t_s: 1e-3,
+):  # fmt: skip
+    """Yield the witness after each frame; samples are changed by `change(t_s, six)`, vision is turned by rad.
+
+    Its way scatters by `way_m(t_s)`, where `stated_m(t_s)` is stated.
+    """
     rng, witness = np.random.default_rng(7), MotionWitness()
     sigmas = np.repeat([1e-3, 1e-2], 3)
 
@@ -40,8 +46,9 @@ def watched(change, until_s=8.0, turned=lambda t_s: 0.0, outliers=lambda t_s: 0.
 
     for k in range(round(until_s / FRAME_S)):
         t_s = k * FRAME_S
-        T = pose(t_s) @ se3_exp(np.array([0.0, 0.0, turned(t_s), *(2e-3 * rng.standard_normal(3))]))
-        vo = VoMeasurement(round(t_s * 1e9), 0, T, np.eye(6) * 1e-6, is_metric, Tracking.OK, 100)
+        T = pose(t_s) @ se3_exp(np.array([0.0, 0.0, turned(t_s), *(way_m(t_s) * rng.standard_normal(3))]))
+        covariance = np.diag(np.repeat([1e-3, stated_m(t_s)], 3) ** 2)
+        vo = VoMeasurement(round(t_s * 1e9), 0, T, covariance, is_metric, Tracking.OK, 100)
         witness.see(vo, outliers(t_s), T, samples, NO_BIAS)
         yield t_s, witness
 
@@ -76,6 +83,14 @@ def test_a_camera_that_follows_what_moves_does_not_take_the_samples_away():
     assert witness.until_ns is None
     *_, (_, witness) = watched(lambda _, six: six, **turned)  # the same, with tracks that agree as ever
     assert witness.until_ns is not None
+
+
+def test_a_vision_that_states_how_unsure_it_is_takes_no_samples_away():
+    scatters = {"way_m": lambda t: 0.06 if t >= BREAK_S else 2e-3}
+    *_, (_, witness) = watched(lambda _, six: six, stated_m=scatters["way_m"], **scatters)
+    assert not witness.doubted_ns
+    *_, (_, witness) = watched(lambda _, six: six, **scatters)  # the same, unstated
+    assert witness.doubted_ns
 
 
 def test_a_buffer_gives_no_span_of_what_is_not_believed_and_names_it():

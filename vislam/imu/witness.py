@@ -1,10 +1,11 @@
 """Whether inertial samples show the motion that a camera sees: other axes, another unit or another clock do not.
 
-Two things are compared over a quarter of a second, and what is usual in a run sets how far apart they may be: by how
-much the body turned, and, where vision has metres, gravity in vision's frame: what the body's acceleration, as three
-places in a row show it, leaves of the force that the accelerometer felt. That is one vector for as long as vision goes
-on unbroken. Which of the two is wrong shows in the tracks: a camera that follows who walks into its view contradicts
-good samples, after many tracks did not agree with the others; bad samples come while the tracks agree as ever.
+Two things are compared over a quarter of a second; what is usual in a run, and how well vision knows where it is at the
+time, set how far apart they may be: by how much the body turned, and, where vision has metres, gravity in vision's
+frame: what the body's acceleration, as three places in a row show it, leaves of the force that the accelerometer felt.
+That is one vector for as long as vision goes on unbroken. Which of the two is wrong shows in the tracks: a camera that
+follows who walks into its view contradicts good samples, after many tracks did not agree with the others; bad samples
+come while the tracks agree as ever.
 """
 
 from collections import deque
@@ -31,6 +32,7 @@ _MISTAKEN = 2.0  # times that without metres: a turn looks much like a motion to
 _FORCE_M_S2, _FORCE_SHARE = 1.0, 0.1  # the same of gravity: a place is off by a centimetre then
 # without metres, mean acceleration over half a second is not seen: as much may be, and as many times the usual
 _UNSEEN_M_S2, _UNSEEN = 5.0, 5.0
+_SURE = 3.0  # times what vision itself states as sigma, where that is more
 _CALM = 3.0  # times the usual difference up to which nothing has begun yet
 _ENOUGH_S = 0.5  # of contradiction more than of agreement, for samples not to be believed ...
 _MOST_WEIGHT = 4.0  # ... where they are off by no more than they may be; one by more counts at most that many times
@@ -48,6 +50,8 @@ class _Seen:
     T_vo_body: Array  # [4, 4]
     R_gyro: Array  # [3, 3] turn of the body
     force_m_s2: Array  # [3] mean, in vision's frame
+    sigma_rad: float  # of vision's turn since its keyframe
+    sigma_m: float  # of its way
 
 
 class Outliers:
@@ -116,12 +120,13 @@ class MotionWitness:
         if vo.tracking is Tracking.OK:
             last = self._frames[-1] if self._frames else None
             span = None if last is None or vo.t_ns - last.t_ns > _LONGEST_NS else samples(last.t_ns, vo.t_ns)
+            sigmas = [float(np.sqrt(np.trace(vo.covariance[k : k + 3, k : k + 3]))) for k in (0, 3)]
             if last is None or span is None:
-                self._frames = [_Seen(vo.t_ns, T_vo_body, np.eye(3), np.zeros(3))]
+                self._frames = [_Seen(vo.t_ns, T_vo_body, np.eye(3), np.zeros(3), *sigmas)]
                 return
             span = subtract_bias(span, *biases)
             force = interpolate(last.T_vo_body, T_vo_body, 0.5)[:3, :3] @ span.accel_m_s2.mean(axis=0)
-            self._frames.append(_Seen(vo.t_ns, T_vo_body, gyro_rotation(span), force))
+            self._frames.append(_Seen(vo.t_ns, T_vo_body, gyro_rotation(span), force, *sigmas))
             self._compare(vo.has_scale)
 
     def doubt(self, until_ns: int, t_ns: int) -> None:
@@ -147,15 +152,19 @@ class MotionWitness:
         turn_rad = max(turns)
         if turns[0] > _LARGE_RAD:
             self.turns.append((R_gyro, R_seen))
-        may_rad = _TURN_RAD if is_metric else _MISTAKEN * _TURN_RAD
-        off, is_calm = self._off(off_rad, self._turns_rad, may_rad + _TURN_SHARE * turn_rad)
+        may_rad = (_TURN_RAD if is_metric else _MISTAKEN * _TURN_RAD) + _TURN_SHARE * turn_rad
+        sigma_rad = float(np.hypot(self._frames[middle].sigma_rad, self._frames[-1].sigma_rad))
+        off, is_calm = self._off(off_rad, self._turns_rad, max(may_rad, _SURE * sigma_rad))
         is_informative = turn_rad > 2.0 * _TURN_RAD
         if first == 0:
-            gravity, own_m_s2 = _gravity(self._frames, middle) if is_metric else (_mean_gravity(self._frames), 0.0)
+            gravity, own_m_s2, sigma_m_s2 = _mean_gravity(self._frames), 0.0, 0.0
+            if is_metric:
+                gravity, own_m_s2, sigma_m_s2 = _gravity(self._frames, middle)
             if self._gravity:
                 off_m_s2 = float(np.linalg.norm(gravity - np.median(self._gravity, axis=0)))
                 may_m_s2 = _FORCE_M_S2 + _FORCE_SHARE * own_m_s2 if is_metric else _UNSEEN_M_S2
                 times = _UNUSUAL if is_metric else _UNSEEN
+                may_m_s2 = max(may_m_s2, _SURE * sigma_m_s2)
                 by_force, is_force_calm = self._off(off_m_s2, self._forces_m_s2, may_m_s2, times)
                 off, is_calm, is_informative = max(off, by_force), is_calm and is_force_calm, True
             if off <= 1.0 and self.until_ns is None:
@@ -229,11 +238,11 @@ def _mean_gravity(frames: Sequence[_Seen]) -> Array:
     return np.asarray(-felt_m_s / (frames[-1].t_ns - frames[0].t_ns))
 
 
-def _gravity(frames: Sequence[_Seen], middle: int) -> tuple[Array, float]:
+def _gravity(frames: Sequence[_Seen], middle: int) -> tuple[Array, float, float]:
     """Return gravity [3] as three places and the forces between them show it, and the body's own acceleration (m/s^2).
 
-    The change of the mean velocity from the first part to the second is the acceleration under a hat that stands on
-    both, with its top at the middle frame.
+    The third value is what the places are unsure of, as sigma of gravity. The change of the mean velocity from the
+    first part to the second is the acceleration under a hat that stands on both, with its top at the middle frame.
     """
     low, top, high = frames[0], frames[middle], frames[-1]
     before_s, after_s = (top.t_ns - low.t_ns) / _NS, (high.t_ns - top.t_ns) / _NS
@@ -244,4 +253,8 @@ def _gravity(frames: Sequence[_Seen], middle: int) -> tuple[Array, float]:
         weight = min(at_s / before_s, (before_s + after_s - at_s) / after_s)
         felt_m_s += weight * (b.t_ns - a.t_ns) / _NS * b.force_m_s2
     area_s = 0.5 * (before_s + after_s)
-    return (change_m_s - felt_m_s) / area_s, float(np.linalg.norm(change_m_s)) / area_s
+    sigma_m_s = np.linalg.norm(
+        [low.sigma_m / before_s, top.sigma_m * (1.0 / before_s + 1.0 / after_s), high.sigma_m / after_s]
+    )
+    own_m_s2, sigma_m_s2 = np.array([np.linalg.norm(change_m_s), sigma_m_s]) / area_s
+    return (change_m_s - felt_m_s) / area_s, float(own_m_s2), float(sigma_m_s2)
