@@ -1,8 +1,10 @@
 """Where a body goes while nothing measures it: on at its velocity, as uncertain as its motion before was changeable.
 
-Without inertial data a loss of sight is bridged by habit: white noise of acceleration turns a constant twist into a
-spread that grows with the cube of time (Bar-Shalom et al., "Estimation with Applications to Tracking and Navigation",
-2001, section 6.2.2). How strong that noise is shows each time how far a body was from where it would have coasted to.
+Its turn ebbs away: who turns fast is about to stop (Singer, "Estimating Optimal Tracking Filter Performance for Manned
+Maneuvering Targets", 1970, of rates in place of accelerations). Without inertial data a loss of sight is bridged by
+habit: white noise of acceleration turns a twist into a spread that grows with the cube of time (Bar-Shalom et al.,
+"Estimation with Applications to Tracking and Navigation", 2001, section 6.2.2). How strong it is shows each time how
+far a body was from where it would have coasted to.
 """
 
 from bisect import bisect_right
@@ -19,6 +21,10 @@ _RECENT_S = 3.0  # a motion that has become wilder is wilder now
 # density of acceleration that anything that carries a camera may begin with, rad^2/s^3 and m^2/s^3: after a second 28
 # degrees and 18 cm. A body that has only stood or gone straight has not shown how it turns
 LEAST_DENSITY = np.array([0.7, 0.1])
+# time constant of a rate of turn: after 0.2 s hands, flights and carts have turned 57 to 94 % of what it would come to,
+# after 1.6 s 15 to 52 %
+_TURN_S = 0.8
+_TURN_SHARE = 0.3  # of what the rate comes to, that a turn is off by about each axis: fast ones by more than usual ones
 _MOST_M_S2 = 25.0  # that a carried camera has for a tenth of a second; impacts have more, for less
 _TAILS = 1.5  # times the sigma: motions change by fits and starts. Measured on nine of flights, hands and carts
 
@@ -90,7 +96,9 @@ class Coasting:
             return None
         dt_s, spread_s = (t_ns - self._t_ns[-1]) / _NS, (t_ns - self._t_twist_ns) / _NS
         variance = np.maximum(self._density(spread_s), LEAST_DENSITY) * (_TAILS**2 * spread_s**3 / 3.0)
-        return se3_exp(self._twists[-1] * dt_s), np.diag(np.repeat(variance, 3))
+        turn_rad = float(np.linalg.norm(self._twists[-1][:3])) * spread_s
+        variance[0] = max(variance[0], (_TURN_SHARE * turn_rad) ** 2)
+        return _moved(self._twists[-1], spread_s - dt_s, spread_s), np.diag(np.repeat(variance, 3))
 
     def _learn(self, t_ns: int, T_vo_body: Array) -> None:
         for n, lag_s in enumerate(_LAGS_S):
@@ -98,7 +106,7 @@ class Coasting:
             if k < 1:  # before the second pose there was no velocity
                 break
             dt_s = (t_ns - self._t_ns[k]) / _NS
-            off = se3_log(invert(self._poses[k] @ se3_exp(self._twists[k] * dt_s)) @ T_vo_body)
+            off = se3_log(invert(self._poses[k] @ _moved(self._twists[k], 0.0, dt_s)) @ T_vo_body)
             density = np.array([off[:3] @ off[:3], off[3:] @ off[3:]]) / dt_s**3  # of three axes, each a third
             self._sums[n] += density
             self._counts[n] += 1
@@ -116,3 +124,9 @@ class Coasting:
     def _at_or_before(self, t_ns: int) -> int:
         """Return which pose is the last one at or before a time, -1: none."""
         return bisect_right(self._t_ns, t_ns) - 1
+
+
+def _moved(twist: Array, from_s: float, to_s: float) -> Array:
+    """Return the motion [4, 4] between two times after a twist [6], per second, was measured."""
+    turned_s = _TURN_S * (np.exp(-from_s / _TURN_S) - np.exp(-to_s / _TURN_S))
+    return se3_exp(twist * np.repeat([turned_s, to_s - from_s], 3))
