@@ -6,8 +6,7 @@ import hashlib
 import math
 import platform
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import Config, MachineConfig, dump, from_data, recorded
-from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import csv_text, refuse_links_out, write_json, write_text
+from vislam.core.errors import DataError, UsageError
+from vislam.core.files import csv_text, refuse_links_out, storage, write_json, write_text
 from vislam.core.log import FILE_NAME, is_written_to
 from vislam.core.memory import FrameEntry, SlamMemory
 from vislam.core.messages import (
@@ -162,15 +161,6 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise DataError(f"{path} holds no object; start the run again with --overwrite")
     return data
-
-
-@contextmanager
-def storage(path: Path) -> Iterator[None]:
-    """Turn failures to write into StorageError with the next step."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written: {error}; free disk space or choose another --out") from error
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
