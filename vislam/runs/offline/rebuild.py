@@ -21,7 +21,6 @@ from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
 from vislam.core.progress import Progress, silent
 from vislam.core.up import Up
-from vislam.factors import rig_from
 from vislam.frontend import knows_scale, mode_for
 from vislam.mapping.cloud.store import packed_labels
 from vislam.mapping.depth.extract import ScanExtractor
@@ -44,11 +43,8 @@ _EXTRACTION = (
 
 def map_settings(run: Path) -> Config:
     """Return the settings of a run; raises DataError when its session cannot be read."""
-    session = Session(run / "session.db")
-    try:
+    with Session(run / "session.db") as session:
         return session.config()
-    finally:
-        session.close()
 
 
 def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress: Progress = silent) -> dict[str, Any]:
@@ -57,11 +53,10 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     `poses` is "graph" for the run's own, or names a `trajectory_NAME.tum` in its folder. Raises UsageError for a
     trajectory that is not there, DataError when the session or the recording cannot be used.
     """
-    session = Session(run / "session.db")
-    try:
+    with Session(run / "session.db") as session:
         info = session.info()
         ran = session.config()
-        rig = rig_from(info["rig"])
+        rig = session.rig()
         if rig.is_blind:
             raise DataError(f"{run} was run without a camera: there is nothing to make a map of")
         level = stored_level(info)
@@ -85,8 +80,6 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
             _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, report)
         else:
             _from_recording(session, mapper, placed, read_setup(run)[0], ran, labels, report)
-    finally:
-        session.close()
     mapper.finish()
     if info.get("first_state") is None:
         level, mapper, placed = _levelled(level, mapper, placed, ran)

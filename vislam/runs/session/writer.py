@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any
@@ -84,13 +84,9 @@ class SessionWriter:
         """
         if not path.is_file():
             raise DataError(f"no session at {path}; a run leaves one as session.db")
-        with readable(path):
-            probe = connect(path)  # what a write-ahead log holds is taken in
-        try:
+        with readable(path), closing(connect(path)) as probe:  # what a write-ahead log holds is taken in
             check_sound(probe, path)
             check_records(probe, path)
-        finally:
-            probe.close()
         writer = cls(path, db := _opened(path))
         with storage(path), writer._transaction():
             writer._bring_up()
