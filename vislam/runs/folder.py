@@ -51,7 +51,7 @@ _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
 _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
 _RUN_FILES = (
     "log.txt", "manifest.json", "config.json", "sensors.json", "metrics.json", "tracking.csv", "loops.csv",
-    "retrieved.csv", "loops_eval.json", "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal",
+    "retrieved.csv", "loops_eval.json", "loops_eval.csv", "loops_eval.svg", "session.db", "session.db-wal",
     "session.db-shm", "session.db-journal", "run.rrd",
     "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
     "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
