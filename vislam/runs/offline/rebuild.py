@@ -77,7 +77,11 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
             progress(done, total, note)
 
         if from_session:
-            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, report)
+            scans = {i: scan for i, scan in session.scans().items() if i in placed}
+            mapper.restore(labels.given(scans, session), placed)
+            for done in range(0, len(scans), config.rebuild_keyframes_per_call):
+                report(done, "octree")
+                mapper.move(nothing)
         else:
             _from_recording(session, mapper, placed, read_setup(run)[0], ran, labels, report)
     mapper.finish()
@@ -195,22 +199,6 @@ class _Labels:
             on_rays = None if labels is None else self._extractor.on_rays(labels)
             out[i] = replace(scan, labels_png=packed_labels(on_rays))
         return out
-
-
-def _from_session(
-    session: Session,
-    mapper: Mapper,
-    placed: dict[int, Array],
-    nothing: GraphUpdate,
-    at_once: int,
-    labels: _Labels,
-    report: Callable[[int, str], None],
-) -> None:
-    scans = {i: scan for i, scan in session.scans().items() if i in placed}
-    mapper.restore(labels.given(scans, session), placed)
-    for done in range(0, len(scans), at_once):
-        report(done, "octree")
-        mapper.move(nothing)
 
 
 def _camera_stamps_ns(session: Session) -> dict[int, int]:

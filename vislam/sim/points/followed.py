@@ -6,7 +6,6 @@ the image: a part of it in which everything moves together, but not as the world
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,8 @@ from vislam.core.camera import Rig
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, Bools, Observations
 from vislam.sim.faults.disturbance import PERSON_M, person_box
-from vislam.sim.motion.spline import Motion
+from vislam.sim.motion.measured import MeasuredMotion
+from vislam.sim.motion.spline import BodySpline
 from vislam.sim.sensing import DepthNoise
 
 Ids = NDArray[np.int64]
@@ -108,20 +108,12 @@ class TrackNoise:
     descriptors: bool
 
 
-class Moves(Protocol):
-    """A body whose state is known at any time."""
-
-    def at(self, t_s: Array) -> Motion:
-        """Return the motion at times [N] in seconds."""
-        ...
-
-
 class SimulatedTracker:
     """Follows landmarks from frame to frame; call `see` in order of time."""
 
     def __init__(
-        self, rig: Rig, field: LandmarkField, motion: Moves, noise: TrackNoise, rng: np.random.Generator,
-        first_id: int = 0,
+        self, rig: Rig, field: LandmarkField, motion: BodySpline | MeasuredMotion, noise: TrackNoise,
+        rng: np.random.Generator, first_id: int = 0,
     ) -> None:  # fmt: skip
         """Start without tracks; ids count from `first_id` on."""
         self._rig, self._field, self._motion, self._noise, self._rng = rig, field, motion, noise, rng
