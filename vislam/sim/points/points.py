@@ -25,7 +25,7 @@ from vislam.sim.faults.disturbance import in_window
 from vislam.sim.motion.measured import MeasuredMotion
 from vislam.sim.motion.motions import POINT_WORLDS, vi_sensor_rig, world_motion, world_rig
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.points.followed import LandmarkField, SimulatedTracker, TrackNoise
+from vislam.sim.points.followed import LandmarkField, SimulatedTracker
 from vislam.sim.sensing import CONSUMER_IMU, sense_imu
 from vislam.sim.worlds.simulation import TrueStates
 from vislam.sim.worlds.table import WORLDS, surrounded
@@ -286,13 +286,7 @@ class PointRecording:
         if camera:
             rig = Rig((rig.cameras[camera],), (rig.T_body_cams[camera],))
             seed = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, camera))
-        noise = TrackNoise(
-            tracks=options.tracks, pixel_sigma_px=options.pixel_sigma_px, stereo_sigma_px=options.stereo_sigma_px,
-            outlier_share=options.outlier_share, dropout_share=options.dropout_share,
-            track_life_s=options.track_life_s, readout_s=options.readout_s, moving_share=options.moving_share,
-            descriptors=options.descriptors,
-        )  # fmt: skip
-        return SimulatedTracker(rig, self.field, self.motion, noise, np.random.default_rng(seed), camera << _ID_BITS)
+        return SimulatedTracker(rig, self.field, self.motion, options, np.random.default_rng(seed), camera << _ID_BITS)
 
     def _frames(self) -> Iterator[Frame]:
         options, tracker = self.options, self.tracker()
