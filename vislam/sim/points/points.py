@@ -298,8 +298,7 @@ class PointRecording:
             if in_window(since_s, options.outage_begin_s, options.outage_length_s, options.outage_every_s):
                 tracks = _nothing(self.true_rig)
             else:
-                length_s = np.inf if options.moving_length_s is None else options.moving_length_s
-                tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, length_s))
+                tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, options.moving_length_s))
             others = ((camera, one.see(t_s, moving=False)) for camera, one in further.items())
             seen = tuple(FurtherTracks(camera, one.track_ids, one.pixels_px) for camera, one in others)
             yield Frame(t_ns, index, (), tracks=replace(tracks, further=seen))
