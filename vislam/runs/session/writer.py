@@ -305,11 +305,7 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _start_data(start: StartFacts) -> dict[str, Any]:
-    return {
-        "status": start.status, "reason": start.reason, "last": state_data(start.last),
-        "scale_sigma": start.scale_sigma, "excitation_m_s2": start.excitation_m_s2, "noise": asdict(start.noise),
-        "first_state": state_data(start.first_state), "begun_t_ns": start.begun_t_ns,
-    }  # fmt: skip
+    return {**asdict(start), "last": state_data(start.last), "first_state": state_data(start.first_state)}
 
 
 def _front_data(front: Learned | None) -> dict[str, Any]:
