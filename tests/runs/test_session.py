@@ -241,6 +241,10 @@ def test_damage_and_strangers_are_refused(tmp_path):
         database.execute("UPDATE keyframes SET T_map_body = x'0011' WHERE id = 1")
     with pytest.raises(DataError, match="damaged"):
         list(Session(tmp_path / "cut.db").keyframes())
+    with editing(tmp_path / "cut.db") as database:
+        database.execute("UPDATE info SET value = '{}' WHERE key = 'rig'")
+    with pytest.raises(DataError, match="damaged"):
+        Session(tmp_path / "cut.db").rig()
 
 
 @pytest.mark.parametrize(

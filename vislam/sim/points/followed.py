@@ -105,7 +105,7 @@ class SimulatedTracker:
         self, rig: Rig, field: LandmarkField, motion: BodySpline | MeasuredMotion, noise: PointOptions,
         rng: np.random.Generator, first_id: int = 0,
     ) -> None:  # fmt: skip
-        """Start without tracks, which go wrong as `noise` says; ids count from `first_id` on."""
+        """Start without tracks, which go wrong as `noise` states; ids count from `first_id` on."""
         self._rig, self._field, self._motion, self._noise, self._rng = rig, field, motion, noise, rng
         self._surroundings = Surroundings(field)
         self._depth_noise = DepthNoise()
