@@ -840,7 +840,7 @@ def _read_stored(folder: Path) -> None:
             recall(stored)
             stored.factor_log()
             stored.config()
-            for many in (stored.keyframes(), stored.edges(), stored.scans(), stored.shifts(), stored.retrieved()):
+            for many in (stored.keyframes(), stored.loops(), stored.scans(), stored.shifts(), stored.retrieved()):
                 for _ in many:
                     pass
 

@@ -6,7 +6,7 @@
 
 Each run is a process of its own, as a user would start it, without map and viewer. A seed is that of the pipeline; of a
 simulated world also that of the place, the motion and the sensors. The runs of a source are pooled: one table
-(`table.md`), one row of pictures per source (`curves.png`), all numbers (`results.json`). What follows `--` goes to
+(`table.md`), two drawings per source (`curves.svg`), all numbers (`results.json`). What follows `--` goes to
 every `vislam run`. A run that fails stays in the table and says so; --reuse takes run folders that are there already.
 
 With --drift the keyframes of each run go through a new detector again, without a graph that would mend anything: their
@@ -169,7 +169,7 @@ def _write(out: Path, answers: dict[str, dict[str, Any]]) -> None:
     write_text(out / "table.md", _table(answers))
     drawn = {name: answer for name, answer in answers.items() if answer["runs"]}
     if drawn:
-        write_loop_plot(out / "curves.png", drawn)
+        write_loop_plot(out / "curves.svg", drawn)
 
 
 def _table(answers: dict[str, dict[str, Any]]) -> str:

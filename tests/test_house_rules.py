@@ -25,11 +25,11 @@ MOST_ATTRIBUTES = 20
 LONGEST_FILE, SHORTEST_FILE = 400, 30  # a shorter one that one file alone uses belongs to that one
 
 # Budgets: a commit that raises one says why. They are to fall to what stands beside them.
-BUDGET_PRODUCT_LINES = 123_770  # to 97,000
-BUDGET_TEST_LINES = 68_480  # to 49,000
+BUDGET_PRODUCT_LINES = 123_188  # to 97,000
+BUDGET_TEST_LINES = 68_376  # to 49,000
 BUDGET_LONG_FILES = 12  # to 0
 BUDGET_WORDS = 43_214  # of README and docs/, as `wc -w` counts
-BUDGET_WIDE_FUNCTIONS = 18  # of more than eight arguments; to 0
+BUDGET_WIDE_FUNCTIONS = 16  # of more than eight arguments; to 0
 BUDGET_BEHIND_DOORS = 2_063  # imports by experiments, benchmarks and tests of other rooms; falling
 BUDGET_PRIVATE_USES = 20  # of attributes with an underscore by tests
 

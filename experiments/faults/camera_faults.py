@@ -9,7 +9,8 @@ from faults.fault_moment import Event, Moment, Stream, changed
 
 from vislam.core import Array, Camera, Frame, ImuSample
 from vislam.core.messages import ImageU8
-from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
+from vislam.sim.faults.disturbance import Disturbance
+from vislam.sim.worlds.simulation import SimOptions
 
 _STEPS = (1.0, 0.4, 1.6, 0.7)  # gains, one after the other
 _STEP_S = 1.5
@@ -85,8 +86,9 @@ SWAPPED = framed(_swapped)
 
 def person(events: Iterator[Event], moment: Moment) -> Iterator[Event]:
     """Put a person over a half of the image who walks to and fro 2 m away, dressed in a pattern."""
-    options = DisturbanceOptions(0.0, 0.0, 0.0, 0.0, 0.0, moving_share=0.5, moving_begin_s=0.0, moving_length_s=np.inf)
-    walking = Disturbance(moment.rig, options, np.random.SeedSequence(int(moment.rng.integers(1 << 31))))
+    walking = Disturbance(
+        moment.rig, SimOptions(moving_share=0.5), np.random.SeedSequence(int(moment.rng.integers(1 << 31)))
+    )
 
     def met(frame: Frame, _: Moment) -> Frame:
         since_s = (frame.t_ns - moment.from_ns) * 1e-9

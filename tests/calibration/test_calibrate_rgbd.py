@@ -41,7 +41,7 @@ def facts(offset_px: tuple[float, float], lag_s: float, factor: float) -> RgbdFa
     edges = EdgeAlignment(
         np.array(offset_px), np.full(2, 0.3), lag_s, 0.002, 9000, 1.8, np.array([bump, bump]), tried, bump, tried
     )
-    return RgbdFacts((), 0.9, 1.5, edges, FocalFit(factor, 0.004, 0.02, 0.001, np.zeros(2), 0.0, 40, 4000, 9.0), 300)
+    return RgbdFacts((), 1.5, edges, FocalFit(factor, 0.004, 0.02, 0.001, np.zeros(2), 0.0, 40, 4000, 9.0), 300)
 
 
 def test_what_is_measured_twice_is_written_once_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

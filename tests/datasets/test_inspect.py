@@ -27,9 +27,8 @@ from vislam.core import (
 from vislam.datasets import open_dataset
 from vislam.datasets.calibration_text import camera_text
 from vislam.datasets.camera_turns import fit_turns, follow_turns, judged_turns
-from vislam.datasets.extrinsics import contradicted_extrinsics
+from vislam.datasets.extrinsics import contradicted_extrinsics, judged_cameras
 from vislam.datasets.inspect import Inspection, inspect
-from vislam.datasets.rig_checks import judged_cameras
 from vislam.live.replay import ReplaySource
 from worlds.bag_writer import from_asl, types_of, write_bag
 from worlds.mini_recording import BEGIN_NS, FRAME_NS, camera_yaml, edit_lines, imu_rows, picture, write_asl, write_imu

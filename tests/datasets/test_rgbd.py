@@ -192,7 +192,7 @@ def facts(offset_px=(0.0, 0.0), sigma_px=0.5, lag_s=0.0, lag_sigma_s=0.002, fact
         np.array(offset_px), np.full(2, sigma_px), lag_s, lag_sigma_s, 9000, 1.8, np.zeros((2, 0)), nothing, nothing,
         nothing,
     )  # fmt: skip
-    return RgbdFacts((), 0.9, 1.5, edges, FocalFit(factor, sigma, 0.0, 0.001, np.zeros(2), 0.0, 40, 4000, 9.0), 300)
+    return RgbdFacts((), 1.5, edges, FocalFit(factor, sigma, 0.0, 0.001, np.zeros(2), 0.0, 40, 4000, 9.0), 300)
 
 
 @pytest.mark.parametrize(

@@ -20,10 +20,9 @@ import pytest
 from vislam.config import BridgeClockConfig, SensorCalibration, SerialConfig
 from vislam.core.errors import HardwareError
 from vislam.core.messages import ImuSample, MagSample
-from vislam.hw.bridge import frame_gaps, protocol
+from vislam.hw.bridge import protocol
 from vislam.hw.bridge.behind import Behind
-from vislam.hw.bridge.bridge import SerialBridge
-from vislam.hw.bridge.frame_gaps import FrameGaps
+from vislam.hw.bridge.bridge import FrameGaps, SerialBridge
 from vislam.hw.bridge.protocol import Chips
 from vislam.hw.emulator import SensorError
 from vislam.hw.emulator import bridge as emulator
@@ -326,7 +325,7 @@ def test_what_lay_in_the_port_for_long_bends_no_stamp_and_is_counted(
     config: SerialConfig, read_board: ReadBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As at the begin of a live run, whose other processes take longer to start."""
-    monkeypatch.setattr(frame_gaps, "_STALE_NS", 500_000_000)
+    monkeypatch.setattr("vislam.hw.bridge.bridge._STALE_NS", 500_000_000)
     bridge = SerialBridge(config)
     before = imu(collect(bridge, lambda found: len(imu(found)) > 10))
     read_board.now_ns += 2_500_000_000

@@ -214,19 +214,6 @@ def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
     source.close()
 
 
-def test_started_before_it_is_there(tmp_path: Path) -> None:
-    source = IioImu(config(), must_be_there=False, root=tmp_path)
-    assert source.read(0.12) == []
-    assert source.health() & Health.IMU_MISSING
-    device = Device(tmp_path, 0, "mpu6050", ("accel", "anglvel"))
-    for _ in range(10):
-        source.read(0.05)
-    device.push(time.monotonic_ns(), 0, 0, 8192, 0, 0, 1)
-    assert len(read_all(source, 1)) == 1
-    assert source.counters().get("reopened", 0) == 0, "it was never away"
-    source.close()
-
-
 def test_what_cannot_be_used_says_so(tmp_path: Path) -> None:
     with pytest.raises(HardwareError, match=r"no device streams.*devices: none"):
         find_devices(tmp_path)

@@ -123,7 +123,7 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
         open_frame_camera("oak", SENSORS)
     monkeypatch.setitem(sys.modules, "depthai", None)
     with pytest.raises(HardwareError, match=r"pip install '\.\[oak\]'"):
-        open_frame_camera("oak", SENSORS, must_be_there=False)
+        open_frame_camera("oak", SENSORS)
 
 
 def test_it_is_recorded_and_examined(world: World, tmp_path: Path) -> None:

@@ -139,7 +139,7 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
         open_camera("picam:front", config)
     monkeypatch.setitem(sys.modules, "picamera2", None)
     with pytest.raises(HardwareError, match=r"pip install '\.\[pi\]'"):
-        open_camera("picam", config, must_be_there=False)
+        open_camera("picam", config)
     assert is_library_camera("picam:1")
     assert not is_video("picam:1")
     assert not is_library_camera("/dev/video0")

@@ -153,7 +153,7 @@ def test_missing_things_are_named(world: World, monkeypatch: pytest.MonkeyPatch)
         open_frame_camera("realsense", SENSORS)
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(HardwareError, match=r"pip install '\.\[realsense\]'"):
-        open_frame_camera("realsense", SENSORS, must_be_there=False)
+        open_frame_camera("realsense", SENSORS)
     assert not is_video("realsense:1.2,depth")
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from vislam.config import BridgeClockConfig
-from vislam.hw.shared_clock import SharedClock
+from vislam.hw.cameras.realsense import SharedClock
 
 WRAP_US = 2**32
 RATE = 1.0001  # device time per host time

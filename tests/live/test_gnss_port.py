@@ -16,8 +16,8 @@ import pytest
 
 from vislam.core.errors import HardwareError
 from vislam.core.readings import Reading
-from vislam.hw import PortReadings, reading_port, talks
-from vislam.hw.reading_port import ReadingPort
+from vislam.hw import PortReadings, port_readings, talks
+from vislam.hw.port_readings import ReadingPort
 from vislam.hw.serial_port import check_port
 from vislam.hw.talks import NmeaStream, UbxStream
 from vislam.sensors.gnss import GnssSettings
@@ -82,7 +82,7 @@ def config(tmp_path: Path) -> SensorPort:
 def test_a_receiver_that_is_unplugged_goes_on_in_the_frame_it_had(
     config: SensorPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reading_port, "_REOPEN_S", 0.02)
+    monkeypatch.setattr(port_readings, "_REOPEN_S", 0.02)
     monkeypatch.setattr(talks, "_OLD_NS", round(HUNG_S * 1e9))
     receiver = Receiver(Path(config.port))
     sensors = PortReadings({"gnss": config})
@@ -143,7 +143,7 @@ def test_a_fix_that_is_not_good_enough_is_told(config: SensorPort) -> None:
 
 
 def test_a_mute_port_is_told_and_opened_anew(config: SensorPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading_port, "_SILENT_NS", 0)
+    monkeypatch.setattr(port_readings, "_SILENT_NS", 0)
     receiver = Receiver(Path(config.port))
     port = ReadingPort("gnss", config)
     try:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.live.test_gnss_port import Receiver
 from vislam.core.readings import Reading
-from vislam.hw import PortReadings, reading_port, talks
+from vislam.hw import PortReadings, port_readings, talks
 from vislam.hw.talks import LineTalk
 from vislam.sensors.gnss import GnssSettings
 from vislam.sensors.ticks import TicksSettings
@@ -105,7 +105,7 @@ def test_counters_that_jump_or_pause_give_no_speed_and_say_why() -> None:
 
 @pytest.fixture
 def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Receiver]:
-    monkeypatch.setattr(reading_port, "_REOPEN_S", 0.02)
+    monkeypatch.setattr(port_readings, "_REOPEN_S", 0.02)
     monkeypatch.setattr(talks, "_OLD_NS", round(HUNG_S * 1e9))
     device = Receiver(tmp_path / "tty")
     yield device

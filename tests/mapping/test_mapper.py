@@ -434,7 +434,7 @@ def test_keyframe_clouds_are_in_the_body_frame():
 
 def test_an_unusable_folder_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StorageError, match="cannot be made"):
+    with pytest.raises(StorageError, match="cannot be written"):
         mapper_at(TRUE[:1]).export(tmp_path / "file")
 
 

@@ -10,8 +10,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import replacing, write_json, write_text
-from vislam.runs.folder import storage
+from vislam.core.files import replacing, storage, write_json, write_text
 from vislam.runs.report.style import light
 
 Draw = Callable[[Figure, Mapping[str, str]], None]  # onto a figure, with the report's colours by name

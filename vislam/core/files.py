@@ -20,6 +20,16 @@ _LINES_AT_ONCE = 4096
 
 
 @contextmanager
+def storage(path: Path) -> Iterator[None]:
+    """Turn a refusal of the system to write into StorageError with the next step."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise StorageError(f"{path} cannot be written: {reason}; free disk space or choose another folder") from error
+
+
+@contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing that takes the place of `path` when the block ends well, and vanishes when it does not.
 
@@ -27,18 +37,16 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # two processes may write the same file
     try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException as error:
+        with storage(path):
+            with partial.open("wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+    except BaseException:
         with suppress(OSError):
             partial.unlink()
-        if not isinstance(error, OSError):
-            raise
-        reason = error.strerror or error
-        raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
+        raise
 
 
 @contextmanager
@@ -47,15 +55,11 @@ def partial_folder(path: Path) -> Iterator[Path]:
 
     Raises StorageError when it cannot be made, or the block cannot write.
     """
-    folder = None
-    try:
+    with storage(path):
         folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent))
-        yield folder
-    except OSError as error:
-        reason = error.strerror or error
-        raise StorageError(f"{path} cannot be written: {reason}; free space or choose another folder") from error
-    finally:
-        if folder is not None:
+        try:
+            yield folder
+        finally:
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -11,7 +11,8 @@ import json
 import os
 import stat
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,22 @@ def open_file(path: Path) -> BufferedReader:
     except BaseException:
         os.close(descriptor)
         raise
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn a refusal of the system to read a file into DataError."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BufferedReader]:
+    """Open a regular file for reading bytes while the block lasts; what the system refuses in it is a DataError."""
+    with readable(path), open_file(path) as file:
+        yield file
 
 
 def check_file(path: Path) -> None:

@@ -1,6 +1,7 @@
 """What every source of measurements offers: dataset readers, the simulated world, live sensors."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -90,6 +91,15 @@ class MaskedRecording(WrappedRecording):
         """Yield the recording's values."""
         for value in self._recording.events(from_ns):
             yield replace(value, masks=tuple(self._masker(value))) if isinstance(value, Frame) else value
+
+
+@contextmanager
+def noted(errors: list[DataError]) -> Iterator[None]:
+    """Add to a list what makes a part of a recording unusable, and go on behind the block."""
+    try:
+        yield
+    except DataError as error:
+        errors.append(error)
 
 
 class Problems(dict[str, int]):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vislam.core.encoded_image import decoded
 from vislam.core.errors import DataError
-from vislam.core.reading import read_bytes
+from vislam.core.reading import read_bytes, readable
 
 _MAX_BYTES = 2**26  # of one file
 _MAX_FILES = 2_000_000
@@ -56,10 +56,8 @@ def read_grey_png(path: Path, bits: tuple[int, int], check_size: Callable[[int, 
     `check_size` raises DataError for a width and height that may not be, before anything is decoded. Raises DataError
     also when the file is something else, or cut.
     """
-    try:
+    with readable(path):
         data = read_bytes(path, _MAX_BYTES)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
     if not data.startswith(_PNG_HEAD) or len(data) < 26 or data[12:16] != b"IHDR":
         raise DataError(f"{path} is no PNG; the numbers must be stored without loss")
     if data[25] != _GREY or data[24] not in bits:

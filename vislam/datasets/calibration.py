@@ -21,7 +21,7 @@ from vislam.core.geometry import are_rotations
 from vislam.core.lens import MODELS as LENS_MODELS
 from vislam.core.lens import Distortion
 from vislam.core.messages import Array
-from vislam.core.reading import MAX_YAML_BYTES, parse_yaml, read_text
+from vislam.core.reading import MAX_YAML_BYTES, parse_yaml, read_text, readable
 from vislam.datasets.images import DepthFormat
 from vislam.datasets.tables import check_size
 from vislam.imu import ImuNoise
@@ -149,7 +149,8 @@ def load_yaml(path: Path) -> dict[str, Any]:
     """
     check_size(path, MAX_YAML_BYTES)
     try:
-        text = read_text(path, MAX_YAML_BYTES)
+        with readable(path):
+            text = read_text(path, MAX_YAML_BYTES)
         lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
         if len(lines) < len(text.splitlines()):  # OpenCV wants no space behind a colon
             lines = [re.sub(r"^(\s*[A-Za-z_][\w.]*):(?=[\w\[\"+-])", r"\1: ", line) for line in lines]
@@ -158,8 +159,6 @@ def load_yaml(path: Path) -> dict[str, Any]:
         if any(lines[end + 1 :]):
             warn_once(f"{path}: of several documents the first is taken")
         data = parse_yaml("\n".join(lines[:end]).replace("!!opencv-matrix", ""))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
     except ValueError as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(f"{path} cannot be read as YAML: {reason}") from error

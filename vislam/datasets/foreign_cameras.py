@@ -21,7 +21,7 @@ from vislam.core.errors import DataError
 from vislam.core.geometry import invert, rotation_from_quaternion_xyzw, transform
 from vislam.core.lens import MODELS, Distortion
 from vislam.core.messages import Array
-from vislam.core.reading import MAX_YAML_BYTES, read_text
+from vislam.core.reading import MAX_YAML_BYTES, read_text, readable
 from vislam.datasets.calibration import (
     WEIGHTY,
     Keys,
@@ -81,15 +81,14 @@ def load_keys(path: Path) -> Keys:
     """Return the mapping in a file of YAML, JSON or OpenCV's XML; raises DataError when it holds none."""
     check_size(path, MAX_YAML_BYTES)
     try:
-        text = read_text(path, MAX_YAML_BYTES).lstrip("\ufeff \t\r\n")
+        with readable(path):
+            text = read_text(path, MAX_YAML_BYTES).lstrip("\ufeff \t\r\n")
         for begin, what in _RESULTS.items():
             if text.startswith(begin):
                 raise DataError(f"{path} is {what}")
         if not text.startswith(("{", "<")):
             return Keys(load_yaml(path))
         data = json.loads(text) if text.startswith("{") else _xml(text)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError, ElementTree.ParseError) as error:
         raise DataError(f"{path} cannot be read as JSON or XML: {' '.join(str(error).split())[:200]}") from error
     return Keys(data)

@@ -18,7 +18,7 @@ import numpy as np
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array
-from vislam.core.reading import open_file
+from vislam.core.reading import opened
 from vislam.core.recording import Problems
 from vislam.datasets.imu_pairs import Rows, paired
 from vislam.datasets.tables import MAX_LINE_BYTES, Row, header, in_time_order, parse_ns, parse_seconds, read_rows
@@ -146,11 +146,7 @@ def _separator(line: str) -> str | None:
 
 def _columns(path: Path) -> tuple[Table, str]:
     """Return the table of a file and in words how its stamps and units are taken."""
-    try:
-        file = open_file(path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
-    with file:
+    with opened(path) as file:
         lines = [file.readline(MAX_LINE_BYTES).decode("utf-8", errors="replace") for _ in range(_LOOKED_AT)]
     separator = next((_separator(line) for line in reversed(lines[:-1]) if line.strip()), None)
     names = header(path, separator)

@@ -14,7 +14,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.encoded_image import most_pixels
 from vislam.core.errors import DataError
 from vislam.core.messages import NO_IMAGE, ImageF32, ImageU8
-from vislam.core.reading import check_file
+from vislam.core.reading import check_file, readable
 from vislam.core.recording import Problems
 from vislam.datasets.images import (
     DepthFormat,
@@ -215,10 +215,8 @@ def check_film(path: Path, images: ImageList, rig: Rig | None, problems: Problem
 
 def open_video(path: Path) -> cv2.VideoCapture:
     """Return an open video; raises DataError when it cannot be read or decoded."""
-    try:
+    with readable(path):
         check_file(path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(f"{path} cannot be opened as a video; check that it plays, or convert it to H.264 or MJPEG")

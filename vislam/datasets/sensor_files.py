@@ -11,7 +11,7 @@ import numpy as np
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.core.reading import open_file
+from vislam.core.reading import opened
 from vislam.core.readings import Reading
 from vislam.core.recording import Problems
 from vislam.datasets.tables import Row, header, in_time_order, parse_ns, parse_seconds, read_rows
@@ -141,14 +141,11 @@ def _nmea(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[R
 
 def _ubx(made: FixReadings, file: SensorFile, problems: Problems) -> Iterator[Reading]:
     fixes, count = UbxFixes(), 0
-    try:
-        with open_file(file.path) as stream:
-            while data := stream.read(_CHUNK_BYTES):
-                for fix in fixes.feed(data):
-                    count += 1
-                    yield from _made(fix, made, file, problems)
-    except OSError as error:
-        raise DataError(f"{file.path} cannot be read: {error.strerror}") from error
+    with opened(file.path) as stream:
+        while data := stream.read(_CHUNK_BYTES):
+            for fix in fixes.feed(data):
+                count += 1
+                yield from _made(fix, made, file, problems)
     if not count and not fixes.undated:
         raise DataError(f"{file.path}: no message NAV-PVT with a fix; set the receiver to send UBX-NAV-PVT")
     place = f"{file.path.parent.name}/{file.path.name}"

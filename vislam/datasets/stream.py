@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,9 @@ from vislam.datasets.loaders import FolderLoader, FrameTable, Loader, Registerin
 from vislam.datasets.tables import Row, in_time_order, read_numbers
 from vislam.imu import ImuCalibration, ImuNoise, MagCalibration
 from vislam.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from vislam.datasets.bags.streams import BagStreams
 
 STEREO_TOLERANCE_NS = 2_000_000  # at 1 m/s the body moves 2 mm in it, far less than any baseline
 DEPTH_TOLERANCE_NS = 20_000_000  # as in the TUM benchmark's own association
@@ -65,36 +68,6 @@ class KnownCamera:
 ForceRows = Callable[[Problems], Iterator[Row[list[float]]]]
 
 
-class Streams(Protocol):
-    """The values of a recording that are messages of one file, not files of their own."""
-
-    @property
-    def size_bytes(self) -> int:
-        """How large it is."""
-        ...
-
-    @property
-    def has_imu(self) -> bool:
-        """Whether there are inertial samples."""
-        ...
-
-    def imu_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
-        """Yield stamp, rates (rad/s) and forces (m/s^2); raises DataError when most cannot be used."""
-        ...
-
-    def mag_rows(self, problems: Problems) -> Iterator[Row[list[float]]]:
-        """Yield stamp and field (µT); raises DataError when most cannot be used."""
-        ...
-
-    def open_loader(self, rig: Rig, frames: FrameTable, cameras: int | None) -> Loader:
-        """Return what loads the images of frames, of the first `cameras` only if given."""
-        ...
-
-    def repeats(self, camera: int) -> Iterator[bool]:
-        """Yield for each image of a camera but the first whether it equals the one before to the byte."""
-        ...
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
     """What a recording holds, as found; `errors` are the reasons why it cannot be replayed, worst first."""
@@ -118,7 +91,7 @@ class Survey:
     R_body_mag: Array = field(default_factory=lambda: np.eye(3))
     truth: Truth | None = None
     forces: ForceRows | None = None  # of an accelerometer without a gyroscope, in body axes
-    streams: Streams | None = None  # images and samples come from here; the files of a camera are names for messages
+    streams: BagStreams | None = None  # images and samples come from here; the files of a camera are names for messages
     topics: tuple[TopicSummary, ...] = ()
     known_cameras: tuple[KnownCamera, ...] = ()  # what is known where there is no rig yet
     lacking: Mapping[str, DataError] = field(default_factory=dict)  # why it cannot be replayed without that option

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from vislam.core.errors import DataError
-from vislam.core.reading import open_file
+from vislam.core.reading import open_file, opened, readable
 from vislam.core.recording import Problems
 from vislam.core.streams import Happening, StreamJudge
 from vislam.trajectory.formats import is_number
@@ -189,10 +189,8 @@ def header(
 
 def check_size(path: Path, limit_bytes: int) -> None:
     """Raise DataError when the file is missing or larger than a file of its kind can sensibly be."""
-    try:
+    with readable(path):
         size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
     if size > limit_bytes:
         raise DataError(f"{path} has {size} bytes, more than the {limit_bytes} allowed; split the recording")
 
@@ -238,11 +236,8 @@ def in_time_order(
 
 def _lines(path: Path, problems: Problems) -> Iterator[tuple[int, str, bool]]:
     """Yield number, text and whether it was ended, of each line that is neither blank nor a comment."""
-    try:
-        with open_file(path) as file:
-            yield from _bounded_lines(file, path, problems)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    with opened(path) as file:
+        yield from _bounded_lines(file, path, problems)
 
 
 def _bounded_lines(file: IO[bytes], path: Path, problems: Problems) -> Iterator[tuple[int, str, bool]]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from vislam.core.cluster import dask_client
 from vislam.core.errors import DataError, TrackingLostError, UsageError
-from vislam.core.files import write_json, write_text
+from vislam.core.files import storage, write_json, write_text
 from vislam.core.progress import Progress, silent
 from vislam.core.reading import parse_toml, read_json
 from vislam.core.revision import code_revision
@@ -29,7 +29,6 @@ from vislam.experiment.slurm import run_on_slurm
 from vislam.experiment.statistics import compare, groups
 from vislam.experiment.store import ResultStore
 from vislam.experiment.trials import Trial, table_sha256, trials
-from vislam.runs.folder import storage
 
 TESTED = ("ate_m", "rpe_5m_percent")
 Outcome = Literal["identical", "within the spread", "differs"]

@@ -28,13 +28,12 @@ class IioImu(InertialSource):
 
     stamped_by = "the kernel, at the chip's interrupt"
 
-    def __init__(self, config: BoardConfig, name: str = "", must_be_there: bool = True, root: Path = Path("/")) -> None:
+    def __init__(self, config: BoardConfig, name: str = "", root: Path = Path("/")) -> None:
         """Find the devices, set them up and start them.
 
         Args:
             config: rate, calibration and times.
             name: of the chip as the kernel has it, or a device such as `iio:device0`; empty: whichever is there.
-            must_be_there: otherwise it is looked for as after unplugging.
             root: where /dev and /sys are.
 
         Raises HardwareError: there is none, or it cannot be set up.
@@ -46,12 +45,7 @@ class IioImu(InertialSource):
         self._pairs = AccelAtGyro(_KEPT)
         self._newest_ns: dict[str, int] = {}  # by device
         self._retry_ns = 0
-        self._is_reopening = False
-        try:
-            self._open()
-        except HardwareError:
-            if must_be_there:
-                raise
+        self._open()
 
     def read(self, timeout_s: float) -> list[ImuSample | MagSample]:
         """Return what was captured, see `InertialSource`; waits for the next sample, `timeout_s` at most."""
@@ -90,7 +84,6 @@ class IioImu(InertialSource):
             except OSError:
                 self._faults.add("gone", Health.BUS_FAULT | Health.IMU_GAP)
                 self.close()
-                self._is_reopening = True
                 self._retry_ns = time.monotonic_ns() + round(self._config.reopen_s * _NS)
                 return []
         merged = self._merged()
@@ -135,7 +128,7 @@ class IioImu(InertialSource):
         except HardwareError:
             self._faults.add("open_failures")
         else:
-            self._faults.add("reopened", times=int(self._is_reopening))
+            self._faults.add("reopened")
 
     def _open(self) -> None:
         devices: list[IioDevice] = []

@@ -41,22 +41,20 @@ def has_depth(name: str) -> bool:
     return bool(options)
 
 
-def open_image_camera(name: str, config: SensorsConfig, must_be_there: bool = True) -> LibraryCamera[CapturedImage]:
+def open_image_camera(name: str, config: SensorsConfig) -> LibraryCamera[CapturedImage]:
     """Open a camera that gives single images.
 
-    Raises HardwareError when its package is not installed or, where it must be there, the camera is missing.
+    Raises HardwareError when its package is not installed or the camera is missing.
     """
     from vislam.hw.cameras.library_camera import LibraryCamera
     from vislam.hw.cameras.picam import PicamStream, camera_number, picamera2
 
     settings = _settings(name, config)
     picamera2()
-    return LibraryCamera(f"picam:{camera_number(settings)}", lambda: PicamStream(settings), settings, must_be_there)
+    return LibraryCamera(f"picam:{camera_number(settings)}", lambda: PicamStream(settings), settings)
 
 
-def open_frame_camera(
-    name: str, config: SensorsConfig, must_be_there: bool = True, imu: OwnImu | None = None
-) -> LibraryCamera[Frame]:
+def open_frame_camera(name: str, config: SensorsConfig, imu: OwnImu | None = None) -> LibraryCamera[Frame]:
     """Open a camera that gives frames; what its own IMU measures goes to `imu`, where that is given.
 
     Raises as `open_image_camera` does, and UsageError for a wrong option.
@@ -69,11 +67,11 @@ def open_frame_camera(
         from vislam.hw.cameras.oak import OakStream, depthai
 
         depthai()
-        return LibraryCamera(shown, lambda: OakStream(settings, with_depth, imu), settings, must_be_there)
+        return LibraryCamera(shown, lambda: OakStream(settings, with_depth, imu), settings)
     from vislam.hw.cameras.realsense import RealsenseStream, pyrealsense2
 
     pyrealsense2()
-    return LibraryCamera(shown, lambda: RealsenseStream(settings, with_depth, imu), settings, must_be_there)
+    return LibraryCamera(shown, lambda: RealsenseStream(settings, with_depth, imu), settings)
 
 
 def reads_own_imu(inertial: str, camera: str) -> bool:
@@ -94,7 +92,7 @@ def reads_own_imu(inertial: str, camera: str) -> bool:
     return True
 
 
-def open_with_imu(name: str, config: SensorsConfig, must_be_there: bool = True) -> tuple[LibraryCamera[Frame], OwnImu]:
+def open_with_imu(name: str, config: SensorsConfig) -> tuple[LibraryCamera[Frame], OwnImu]:
     """Open a camera and the IMU inside it, in this process; closing the camera gives both back.
 
     Raises HardwareError where either is missing, or its package is not installed.
@@ -103,8 +101,8 @@ def open_with_imu(name: str, config: SensorsConfig, must_be_there: bool = True) 
 
     settings = frame_config(name, config)
     imu = OwnImu(_kind(name), settings)
-    camera = open_frame_camera(name, config, must_be_there, imu)
-    if must_be_there and not imu.wait(settings.start_s):
+    camera = open_frame_camera(name, config, imu)
+    if not imu.wait(settings.start_s):
         camera.close()
         raise HardwareError(
             f"the {_kind(name)} gives images, but its IMU no samples within {settings.start_s:g} s "

@@ -36,9 +36,7 @@ CHIPS: dict[str, ImuChip | None] = {
 INERTIAL_KINDS = ("gy85", *CHIPS, "bno085", "adafruit", "iio", "serial", *WITH_IMU)
 
 
-def open_inertial(
-    name: str, config: SensorsConfig, must_be_there: bool = True, further: socket.socket | None = None
-) -> InertialSource:
+def open_inertial(name: str, config: SensorsConfig, further: socket.socket | None = None) -> InertialSource:
     """Open what a name gives; the rest is in the settings.
 
     `gy85[:BUS]`, `board[:BUS]` or a chip in its place, `bno085`, `adafruit:MODULE.CLASS`, `iio[:NAME]` for a chip that
@@ -48,14 +46,14 @@ def open_inertial(
 
     Raises:
         UsageError: there is no such kind of sensor.
-        HardwareError: the sensor is missing and must be there.
+        HardwareError: the sensor is missing.
     """
     kind, _, where = name.partition(":")
     if kind in CHIPS:
         from vislam.hw.fifo_board import FifoBoard
 
         board = _placed(config.board, bus=where, chip=CHIPS[kind])
-        return FifoBoard(board, must_be_there=must_be_there, named=kind)
+        return FifoBoard(board, named=kind)
     if kind in ("bno085", "adafruit"):
         from vislam.hw.adafruit import BNO085, open_adafruit
 
@@ -63,15 +61,15 @@ def open_inertial(
     if kind == "iio":
         from vislam.hw.iio_imu import IioImu
 
-        return IioImu(config.board, where, must_be_there)
+        return IioImu(config.board, where)
     if kind == "gy85":
         from vislam.hw.gy85 import Gy85
 
-        return Gy85(_placed(config.gy85, bus=where), must_be_there=must_be_there)
+        return Gy85(_placed(config.gy85, bus=where))
     if kind == "serial":
         from vislam.hw.bridge.bridge import SerialBridge
 
-        return SerialBridge(_placed(config.serial, port=where), must_be_there, further)
+        return SerialBridge(_placed(config.serial, port=where), further=further)
     reads_own_imu(name, "none")  # raises: its camera has to be opened with it
     raise UsageError(
         f"no IMU called '{name}'; there are: {', '.join(INERTIAL_KINDS)}, with a place such as gy85:/dev/i2c-1, "
@@ -97,25 +95,21 @@ def _is_board(name: str) -> bool:
 
 
 def open_camera(
-    name: str,
-    config: SensorsConfig,
-    must_be_there: bool = True,
-    stamps_ns: Sequence[int] | None = None,
-    in_real_time: bool = True,
+    name: str, config: SensorsConfig, stamps_ns: Sequence[int] | None = None, in_real_time: bool = True
 ) -> VideoCamera | LibraryCamera[CapturedImage]:
     """Open a camera by its index or device file, `webcam` as in the settings, `picam`, or a video in its place.
 
-    Raises HardwareError when it is missing and must be there.
+    Raises HardwareError when it is missing.
     """
     if is_library_camera(name):
-        return open_image_camera(name, config, must_be_there)
+        return open_image_camera(name, config)
     if is_video(name):
         from vislam.hw.cameras.video import VideoCamera
 
         return VideoCamera(Path(name), stamps_ns, in_real_time)
     from vislam.hw.cameras.webcam import Webcam
 
-    return Webcam(config.webcam if name == "webcam" else replace(config.webcam, device=name), must_be_there)
+    return Webcam(config.webcam if name == "webcam" else replace(config.webcam, device=name))
 
 
 def check_devices(inertial: str, camera: str, config: SensorsConfig) -> None:

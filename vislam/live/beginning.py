@@ -29,12 +29,9 @@ def in_map(base: MapChoice, recording: Recording, config: Config) -> Beginning:
     """Return the beginning in a map; raises UsageError when the sensors cannot go on in it, DataError without one."""
     from vislam.runs import imu_noise, map_of  # whole runs, which the processes that get a beginning need not load
 
-    stored = Session(base.session)
-    try:
+    with Session(base.session) as stored:
         noise = imu_noise(config.imu, recording.imu_noise)
         return _of(map_of(stored, recording, config, noise, base.localize_only), base.session, is_own=False)
-    finally:
-        stored.close()
 
 
 def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None:
@@ -53,14 +50,11 @@ def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None
             f"{out} was recorded without a camera, and no place tells where the cart is now; start a new run: vislam "
             "live --out NEW"
         )
-    stored = Session(path)
-    try:
+    with Session(path) as stored:
         memory = recall(stored)
         if memory is None:
             return None
         check_fits(stored, recording, config, imu_noise(config.imu, recording.imu_noise))
-    finally:
-        stored.close()
     if memory.front.t_ns >= time.monotonic_ns():
         raise UsageError(
             f"the machine was restarted since {out} was recorded, and its clock begins again; start a new run in "
@@ -71,11 +65,8 @@ def resumed(out: Path, recording: Recording, config: Config) -> Beginning | None
 
 def recalled(beginning: Beginning) -> SlamMemory:
     """Read what a process needs of the session."""
-    stored = Session(beginning.session)
-    try:
+    with Session(beginning.session) as stored:
         memory = recall(stored)
-    finally:
-        stored.close()
     if memory is None:
         raise DataError(f"{beginning.session} was changed while the run began; start it again")
     return replace(memory, held=beginning.held, map_keyframes=beginning.first_id, T_guess=beginning.T_guess)

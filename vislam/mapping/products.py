@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from numpy.typing import NDArray
 
 from vislam.config import MapConfig
-from vislam.core.errors import DataError, StorageError
-from vislam.core.files import replacing
+from vislam.core.errors import DataError
+from vislam.core.files import replacing, storage
 from vislam.core.kinds import Kinds, lacking
 from vislam.mapping.cloud.cloud import Cloud
 from vislam.mapping.cloud.mesh import Mesh, poisson_mesh
@@ -59,10 +59,8 @@ def write_products(
 
     Raises StorageError when one cannot be written.
     """
-    try:
+    with storage(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"{folder} cannot be made: {error.strerror}; choose another folder") from error
     cloud, mesh, surfels = cache(source.cloud), cache(source.mesh), cache(source.surfels)
     labels = source.labels()
     in_colors = config.labels.cloud_colors

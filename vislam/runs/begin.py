@@ -11,6 +11,7 @@ import numpy as np
 
 from vislam.config import Config, recorded
 from vislam.core.errors import DataError, UsageError
+from vislam.core.files import storage
 from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.core.memory import SlamMemory
 from vislam.core.messages import Array
@@ -21,7 +22,7 @@ from vislam.imu import ImuNoise
 from vislam.mapping.semantic.images import LabelFolder
 from vislam.pipeline.settings import derived
 from vislam.runs.drive import Run, imu_noise
-from vislam.runs.folder import MapChoice, storage, write_setup
+from vislam.runs.folder import MapChoice, write_setup
 from vislam.runs.levelled import stored_up
 from vislam.runs.session import Session, SessionWriter, has_begun, recall
 
@@ -68,11 +69,8 @@ def resume(
     if has_begun(path):
         session = SessionWriter.reopen(path)
         run = Run(recording, config, out, session)
-        stored = Session(path)
-        try:
+        with Session(path) as stored:
             is_begun = run.resume(stored)
-        finally:
-            stored.close()
         if is_begun:
             return run.execute(progress)
         session.close()
@@ -103,14 +101,11 @@ def begun(
     if base is None:
         write_setup(out, config, source, command)
         return make(SessionWriter.create(path, info, recording.rig, noise, config.machine.gravity_m_s2))
-    stored = Session(base.session)
-    try:
+    with Session(base.session) as stored:
         memory = map_of(stored, recording, config, noise, base.localize_only)
         write_setup(out, config, source, command, base)
         up = stored_up(stored.info())
         session = SessionWriter.in_map(path, stored, info, noise, base.localize_only, bool(memory.scans), up)
-    finally:
-        stored.close()
     run = make(session)
     run.begin_in_map(memory)
     if not memory.scans and config.map.enabled:

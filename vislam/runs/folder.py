@@ -6,8 +6,7 @@ import hashlib
 import math
 import platform
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import Config, MachineConfig, dump, from_data, recorded
-from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import csv_text, refuse_links_out, write_json, write_text
+from vislam.core.errors import DataError, UsageError
+from vislam.core.files import csv_text, refuse_links_out, storage, write_json, write_text
 from vislam.core.log import FILE_NAME, is_written_to
 from vislam.core.memory import FrameEntry, SlamMemory
 from vislam.core.messages import (
@@ -52,7 +51,7 @@ _HASHED_SUFFIXES = {".csv", ".txt", ".yaml", ".json"}
 _PACKAGES = ("vislam", "numpy", "scipy", "gtsam", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
 _RUN_FILES = (
     "log.txt", "manifest.json", "config.json", "sensors.json", "metrics.json", "tracking.csv", "loops.csv",
-    "retrieved.csv", "loops_eval.json", "loops_eval.csv", "loops_eval.png", "session.db", "session.db-wal",
+    "retrieved.csv", "loops_eval.json", "loops_eval.csv", "loops_eval.svg", "session.db", "session.db-wal",
     "session.db-shm", "session.db-journal", "run.rrd",
     "report.html", "states_ekf.csv", "states_graph.csv", "trajectory_ekf.tum", "trajectory_live.tum",
     "trajectory_graph.tum", "trajectory_batch.tum", "trajectory_truth.tum", "states_batch.csv",
@@ -162,15 +161,6 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise DataError(f"{path} holds no object; start the run again with --overwrite")
     return data
-
-
-@contextmanager
-def storage(path: Path) -> Iterator[None]:
-    """Turn failures to write into StorageError with the next step."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written: {error}; free disk space or choose another --out") from error
 
 
 def read_metrics(run: Path) -> dict[str, Any]:

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vislam.core.files import replacing
+from vislam.core.files import replacing, storage
 from vislam.core.messages import Array, ImageU8, LoopDecision
 from vislam.loop import LoopRow
 from vislam.pipeline.steps import KeyframeStep
-from vislam.runs.folder import storage
 
 FOLDER = "loops"
 _WIDTH_PX = 300  # of one image

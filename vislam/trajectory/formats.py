@@ -20,7 +20,7 @@ from vislam.core.errors import DataError
 from vislam.core.files import write_lines
 from vislam.core.geometry import quaternion_xyzw_from_rotation
 from vislam.core.messages import Array
-from vislam.core.reading import open_file
+from vislam.core.reading import opened
 from vislam.core.streams import Happening, StreamJudge
 from vislam.core.trajectory import Trajectory
 
@@ -91,10 +91,12 @@ def write_kitti(trajectory: Trajectory, path: Path) -> None:
 def data_lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[int, str]]:
     """Yield (line number, stripped line) of what is neither empty nor a comment (# or %); these go to `comments`."""
     try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise DataError(f"{path} has {size / 2**20:.0f} MiB; a trajectory file has at most {_MAX_BYTES >> 20} MiB")
-        with open_file(path) as file:
+        with opened(path) as file:
+            size = path.stat().st_size
+            if size > _MAX_BYTES:
+                raise DataError(
+                    f"{path} has {size / 2**20:.0f} MiB; a trajectory file has at most {_MAX_BYTES >> 20} MiB"
+                )
             number = 0
             while raw := file.readline(_MAX_LINE_BYTES):
                 number += 1
@@ -108,8 +110,6 @@ def data_lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[
                     yield number, line
                 elif line and comments is not None:
                     comments.append(line.lstrip("#% "))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise DataError(f"{path}:{number}: not text ({error.reason}); is this a trajectory file?") from error
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
-from vislam.core.reading import open_file
+from vislam.core.reading import open_file, opened
 from vislam.core.trajectory import Trajectory
 from vislam.trajectory.formats import (
     data_lines,
@@ -144,11 +144,8 @@ def _without_stamps(path: Path, times: Path | None, layout: _Layout, numbers: Ar
 
 
 def _refuse_others(path: Path) -> None:
-    try:
-        with open_file(path) as file:
-            head = file.read(32)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    with opened(path) as file:
+        head = file.read(32)
     for begin, what in _OTHERS.items():
         if head.startswith(begin):
             raise DataError(f"{path} is {what}")

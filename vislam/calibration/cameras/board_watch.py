@@ -13,6 +13,7 @@ from vislam.calibration.options import BoardOptions, CameraOptions
 from vislam.calibration.outcome import Outcome
 from vislam.calibration.watching import Progress, Value
 from vislam.core.errors import DataError, StorageError
+from vislam.core.files import storage
 from vislam.core.messages import Array, Frame, ImageU8
 
 _VIEWS = "camera-views"  # folder of the images that were kept
@@ -67,11 +68,9 @@ class BoardWatch:
             return "these are enough: finish"
         if not differing(view, self._views, self._size, _NEW):
             return self._lacking()
-        try:
+        with storage(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
             is_written = cv2.imwrite(str(self._folder / view.name), image)
-        except OSError as error:
-            raise StorageError(f"{self._folder} cannot be written: {error}") from error
         if not is_written:
             raise StorageError(f"{self._folder / view.name} cannot be written; is the disk full?")
         self._views.append(view)

@@ -156,7 +156,7 @@ def _eval_loops(options: EvalOptions) -> int:
     from vislam.runs.report import write_loop_plot, write_report
 
     answer = evaluate_loops(options.estimate, options.truth, options.reference)
-    write_loop_plot(options.estimate / "loops_eval.png", {options.estimate.resolve().name: answer})
+    write_loop_plot(options.estimate / "loops_eval.svg", {options.estimate.resolve().name: answer})
     write_report(options.estimate)
     if options.json:
         print(json.dumps(answer))

@@ -13,7 +13,7 @@ from vislam.core.reading import Budget, open_file
 from vislam.core.recording import Problems
 from vislam.datasets.bags import mcap, rosbag1, sqlite
 from vislam.datasets.bags.chunks import unpacked_message
-from vislam.datasets.bags.stored import HEAD_BYTES, MOST_MESSAGE_BYTES, Container, DamagedError, Found, Place
+from vislam.datasets.bags.stored import HEAD_BYTES, MOST_MESSAGE_BYTES, DamagedError, Found, Place
 from vislam.datasets.calibration import load_yaml
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -24,6 +24,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _MOST_FILES = 10_000
 _PIXEL_BYTES, _AROUND_BYTES = 8, 2**16  # of an image message
 _FREE_BYTES, _TIMES = 2**25, 100  # of another that was packed by itself, of which a first image may be one
+Container = mcap.Mcap | rosbag1.Rosbag1 | sqlite.Database
 
 
 class Bag:

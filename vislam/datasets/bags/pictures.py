@@ -34,7 +34,6 @@ class _Layout(NamedTuple):
     channels: int
     dtype: str
     to_bgr: int | None = None  # OpenCV's code; None: grey already, or BGR
-    to_grey: int | None = None  # where it is not that of BGR
 
 
 _RGB, _RGBA, _BGRA = cv2.COLOR_RGB2BGR, cv2.COLOR_RGBA2BGR, cv2.COLOR_BGRA2BGR

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
-
-from vislam.core.recording import Problems
+from typing import NamedTuple
 
 HEAD_BYTES = 512  # of a message: all of an inertial one, and the header of every other
 MOST_MESSAGE_BYTES = 2**28  # as of an image file
@@ -41,25 +38,6 @@ class Found(NamedTuple):
     log_ns: int
     place: Place
     head: bytes  # its first bytes, `HEAD_BYTES` at most
-
-
-class Container(Protocol):
-    """One file of a bag."""
-
-    def scan(self, problems: Problems) -> Iterator[Found]:
-        """Yield the messages in the order in which they were stored; what is damaged is counted and passed over.
-
-        Raises DataError when it is no file of its kind.
-        """
-        ...
-
-    def read(self, place: Place) -> bytes:
-        """Return the bytes of a message; raises DamagedError when they cannot be had."""
-        ...
-
-    def close(self) -> None:
-        """Let go of the file."""
-        ...
 
 
 class DamagedError(Exception):

@@ -46,7 +46,7 @@ class ImageTopic:
 
 
 class BagStreams:
-    """What a run reads of a bag; implements `vislam.datasets.stream.Streams`."""
+    """What a run reads of a bag: the values of a recording that are messages of one file, not files of their own."""
 
     def __init__(
         self,

@@ -15,7 +15,7 @@ from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
-from vislam.core.recording import Problems
+from vislam.core.recording import Problems, noted
 from vislam.datasets import calibration as files
 from vislam.datasets.calibration import CAMERA_EXAMPLE, DEPTH_UNITS_PER_M, CameraFile
 from vislam.datasets.camera_files import read_cameras
@@ -84,11 +84,9 @@ def _root(path: Path) -> Path | None:
 
 def _pair(root: Path, errors: list[DataError]) -> tuple[Pair, Finding] | None:
     """Return the tables of rates and forces where they are apart: in `imu0`, or as `gyro0` and `accel0` beside it."""
-    try:
+    with noted(errors):
         return pair_in(root / "imu0") or pair_in(root)
-    except DataError as error:
-        errors.append(error)
-        return None
+    return None
 
 
 def _imu(
@@ -98,7 +96,7 @@ def _imu(
     data, sensor = pair or root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
     if not data.is_file():
         return None, None, np.eye(4), None
-    try:
+    with noted(errors):
         if sensor.is_file():
             noise, T_body_imu = files.read_imu(sensor)
             return data, noise, T_body_imu, calibration_in(files.load_yaml(sensor), sensor, ImuCalibration)
@@ -106,9 +104,7 @@ def _imu(
         if kalibr is None:
             raise DataError(f"{sensor} is missing; write the IMU's noise into it, see docs/formats.md")
         return data, read_noise(kalibr), np.eye(4), None
-    except DataError as error:
-        errors.append(error)
-        return data, None, np.eye(4), None
+    return data, None, np.eye(4), None
 
 
 def _cameras(
@@ -122,16 +118,12 @@ def _cameras(
         if not folder.is_dir():
             break
         rate_hz = None
-        try:
+        with noted(errors):
             found.append(_camera_file(root, index))
             rate_hz = found[-1].rate_hz
-        except DataError as error:
-            errors.append(error)
-        try:
+        with noted(errors):
             rows = read_names(folder / "data.csv", problems)
             lists.append(image_list(folder.name, folder / "data", rows, problems, rate_hz))
-        except DataError as error:
-            errors.append(error)
     if not lists or len(lists) != len(found):
         return tuple(lists), None, ()
     poses = tuple(invert(T_body_imu) @ camera.T_body_cam for camera in found)
@@ -165,12 +157,10 @@ def _depth(
     usual = DepthFormat(DEPTH_UNITS_PER_M)
     if rig is None or not folder.is_dir():
         return None, usual
-    try:
+    with noted(errors):
         how = files.depth_format(folder / "sensor.yaml", rig.cameras[0], usual)
         return image_list("depth0", folder / "data", read_names(folder / "data.csv", problems), problems), how
-    except DataError as error:
-        errors.append(error)
-        return None, usual
+    return None, usual
 
 
 def _mag(root: Path, T_body_imu: Array, errors: list[DataError]) -> tuple[Path | None, Array, MagCalibration | None]:

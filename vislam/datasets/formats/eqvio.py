@@ -22,7 +22,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError, UsageError
 from vislam.core.geometry import rotation_from_quaternion_xyzw, transform
 from vislam.core.messages import Array, Frame, ImuSample, Observations
-from vislam.core.reading import open_file
+from vislam.core.reading import opened
 from vislam.core.recording import Problems
 from vislam.datasets.tables import Row, check_size, in_time_order, parse_seconds, read_rows
 from vislam.imu import ImuNoise
@@ -162,11 +162,8 @@ def read_track_table(path: Path, problems: dict[str, int]) -> TrackTable:
 
 
 def _check_head(path: Path) -> None:
-    try:
-        with open_file(path) as file:
-            head = file.readline(256)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    with opened(path) as file:
+        head = file.readline(256)
     if not head.startswith(f"{_FIRST_COLUMN},".encode()):
         raise DataError(f"{path} is no table of tracks: its first line does not begin with '{_FIRST_COLUMN},'")
 

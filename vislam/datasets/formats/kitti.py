@@ -15,7 +15,7 @@ from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array
 from vislam.core.reading import open_file, read_bytes
-from vislam.core.recording import Problems
+from vislam.core.recording import Problems, noted
 from vislam.datasets.formats.truth import Truth, kitti_truth
 from vislam.datasets.images import ImageList, UnreadableImageError, probe
 from vislam.datasets.stream import Survey
@@ -38,15 +38,13 @@ def survey(path: Path) -> Survey:
     numbers = _camera_numbers(path)
     cameras: tuple[ImageList, ...] = ()
     rig, truth = None, None
-    try:
+    with noted(errors):
         if not numbers:
             raise DataError(f"{path} holds no images: looked for image_0 or image_2")
         t_ns = _times(path / "times.txt")
         cameras = tuple(_images(path / f"image_{number}", f"cam{i}", t_ns) for i, number in enumerate(numbers))
         truth = _truth(path, t_ns)
         rig = _rig(path / "calib.txt", numbers, _first_size(cameras[0]))
-    except DataError as error:
-        errors.append(error)
     return Survey(
         format="kitti", root=path, cameras=cameras, rig=rig, truth=truth, problems=problems, errors=tuple(errors)
     )

@@ -25,7 +25,7 @@ from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
 from vislam.core.reading import read_text
-from vislam.core.recording import Problems
+from vislam.core.recording import Problems, noted
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_pairs import ImuRows
@@ -66,26 +66,20 @@ def survey(path: Path) -> Survey:
     imu_noise, T_body_imu, rig, video = None, np.eye(4), None, None
     cameras: tuple[ImageList, ...] = ()
     logger = _logger(path)
-    try:
+    with noted(errors):
         samples, findings = _samples(path, logger)
         imu_noise, T_body_imu = read_imu(_asked(path / "imu.yaml", "write the noise of the IMU into it"))
-    except DataError as error:
-        errors.append(error)
     if logger == "two tables" and not _films(path):
         return Survey("phone", path, samples=samples, imu_noise=imu_noise, findings=tuple(findings),
                       problems=problems, errors=tuple(errors))  # fmt: skip
-    try:
+    with noted(errors):
         file = read_camera(_asked(path / "camera.yaml", f"write the calibration into it: {CAMERA_EXAMPLE}"))
         rig = Rig((file.camera,), (invert(T_body_imu) @ file.T_body_cam,))
-    except DataError as error:
-        errors.append(error)
-    try:
+    with noted(errors):
         images, video = _frames(path, logger, problems)
         cameras = (images,)
         if video is not None:
             check_film(video, images, rig, problems)
-    except DataError as error:
-        errors.append(error)
     return Survey(
         format="phone", root=path, cameras=cameras, video=video, rig=rig, samples=samples, imu_noise=imu_noise,
         findings=tuple(findings), problems=problems, errors=tuple(errors),

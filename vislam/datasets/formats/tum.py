@@ -16,7 +16,7 @@ import numpy as np
 
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
-from vislam.core.recording import Problems
+from vislam.core.recording import Problems, noted
 from vislam.datasets.calibration import CAMERA_EXAMPLE, CameraFile, depth_format, read_camera
 from vislam.datasets.formats.truth import tum_truth
 from vislam.datasets.images import DepthFormat, ImageList
@@ -49,19 +49,15 @@ def survey(path: Path) -> Survey:
     how = DepthFormat(_DEPTH_UNITS_PER_M)
     calibration: CameraFile | None = None
     color = depth = None
-    try:
+    with noted(errors):
         calibration = _calibration(path)
         how = calibration.depth.over(how)
         if (path / _DEPTH_FILE).is_file():
             how = depth_format(path / _DEPTH_FILE, calibration.camera, how)
-    except DataError as error:
-        errors.append(error)
-    try:
+    with noted(errors):
         color = _images("cam0", path, "rgb.txt", problems)
         if (path / "depth.txt").is_file():
             depth = _images("depth0", path, "depth.txt", problems)
-    except DataError as error:
-        errors.append(error)
     rig = None
     if calibration is not None:
         rig = Rig((calibration.camera,), (np.eye(4),), has_depth=depth is not None)

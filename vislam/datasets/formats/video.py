@@ -23,7 +23,7 @@ from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.geometry import invert
-from vislam.core.recording import Problems
+from vislam.core.recording import Problems, noted
 from vislam.datasets.calibration import CAMERA_EXAMPLE, read_camera, read_imu
 from vislam.datasets.images import ImageList
 from vislam.datasets.imu_pairs import ImuRows
@@ -82,7 +82,7 @@ def _survey(path: Path, joined: bool) -> Survey:
     if (why := _why_unused(path)) and telemetry is not None and telemetry.has_imu:
         findings.append(Finding("warning", f"the IMU of the telemetry is not used: {why}", path.name, ""))
     samples: ImuRows | None = telemetry if telemetry is not None and telemetry.has_imu and not why else None
-    try:
+    with noted(errors):
         if not path.with_suffix(".imu.csv").is_file() and (pair := pair_in(path.parent, path.stem)) is not None:
             samples, stated = pair
             findings.append(stated)
@@ -94,15 +94,11 @@ def _survey(path: Path, joined: bool) -> Survey:
             raise DataError(f"{path.with_suffix('.yaml')} is missing; write the calibration into it: {CAMERA_EXAMPLE}")
         file = read_camera(path.with_suffix(".yaml"))
         rig = Rig((file.camera,), (invert(T_body_imu) @ file.T_body_cam,))
-    except DataError as error:
-        errors.append(error)
-    try:
+    with noted(errors):
         film = joined_film(path) if joined and is_mp4(path) and later_chapters(path) != ([], "") else None
         own_clock = path.with_suffix(".imu.csv").is_file() or isinstance(samples, Pair)
         cameras = (_frames(path, problems, own_clock) if film is None else _of_film(film, path, problems),)
         check_film(path, cameras[0], rig, problems)
-    except DataError as error:
-        errors.append(error)
     return Survey(
         format="video",
         root=path,

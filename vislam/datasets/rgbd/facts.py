@@ -46,7 +46,6 @@ class RgbdFacts:
     """What was measured; None where the recording does not show it."""
 
     odd_values: tuple[OddValue, ...]
-    valid_share: float  # of the pixels that have a depth
     median_depth_m: float  # NaN without any
     edges: EdgeAlignment | None
     focal: FocalFit | None
@@ -68,23 +67,23 @@ class RgbdFacts:
 
 def rgbd_facts(found: Survey, rig: Rig, frames: FrameTable, progress: Progress = silent) -> RgbdFacts:
     """Measure a recording with depth; raises DataError when an image is not of the calibrated size."""
-    odd, valid_share, median_m = _numbers(found, rig)
+    odd, median_m = _numbers(found, rig)
     given = found.depth_format
     unknown = tuple(one.value for one in odd if not one.is_known)
     found = replace(found, depth_format=replace(given, invalid=(*given.invalid, *unknown)))
     seen = walk(found, rig, frames, progress)
     edges = align_edges(seen.ends)
     focal = _focal(found, rig, frames, seen, edges)
-    return RgbdFacts(odd, valid_share, median_m, edges, focal, seen.frames, seen.depth_rows)
+    return RgbdFacts(odd, median_m, edges, focal, seen.frames, seen.depth_rows)
 
 
-def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, float]:
-    """Return numbers that are no depth, the share of pixels with depth, and its median in metres."""
+def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float]:
+    """Return numbers that are no depth, and the median of depth in metres, NaN without any."""
     counts, images = np.zeros((2, NO_DEPTH + 1), dtype=np.int64)
     read = 0
     depth = found.depth
     if depth is None or found.streams is not None or not depth.files:
-        return (), float("nan"), float("nan")
+        return (), float("nan")
     for i in np.unique(np.linspace(0, len(depth.files) - 1, _HISTOGRAMS).astype(int)):
         try:
             raw = read_raw_depth(depth.path(int(i)), found.depth_format.camera(rig.cameras[0]))
@@ -92,16 +91,15 @@ def _numbers(found: Survey, rig: Rig) -> tuple[tuple[OddValue, ...], float, floa
         except UnreadableImageError:
             continue
         counts, images, read = counts + one, images + (one > 0), read + 1
-    total = int(counts.sum())
     odd = odd_values(counts, images >= _OFTEN * max(read, 1), found.depth_format.invalid)
     for value in {0, NO_DEPTH, *found.depth_format.invalid, *(one.value for one in odd)}:
         if 0 <= value <= NO_DEPTH:
             counts[value] = 0
     valid = int(counts.sum())
     if valid == 0:
-        return odd, 0.0, float("nan")
+        return odd, float("nan")
     median = int(np.searchsorted(np.cumsum(counts), 0.5 * valid))
-    return odd, valid / total, median / found.depth_format.units_per_m
+    return odd, median / found.depth_format.units_per_m
 
 
 def odd_values(counts: NDArray[np.int64], often: Bools, known: Sequence[int]) -> tuple[OddValue, ...]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vislam.core.errors import DataError
 from vislam.core.findings import Finding
 from vislam.core.messages import Array
-from vislam.core.reading import open_file
+from vislam.core.reading import opened
 from vislam.core.recording import Problems
 from vislam.datasets.imu_pairs import Rows, paired
 from vislam.datasets.tables import in_time_order
@@ -185,21 +185,18 @@ class Telemetry:
     def _payloads(self) -> Iterator[tuple[int, list[Stream]]]:
         """Yield index and streams of each payload."""
         self._damaged = 0
-        try:
-            with open_file(self.path) as file:
-                end = os.fstat(file.fileno()).st_size
-                for index, (at, size) in enumerate(
-                    zip(self._track.offsets.tolist(), self._track.sizes.tolist(), strict=True)
-                ):
-                    if size > _MOST_PAYLOAD_BYTES or at + size > end:
-                        self._damaged += 1
-                        continue
-                    file.seek(at)
-                    streams, whole = read_streams(file.read(size))
-                    self._damaged += not whole
-                    yield index, streams
-        except OSError as error:
-            raise DataError(f"{self.path} cannot be read: {error.strerror or error}") from error
+        with opened(self.path) as file:
+            end = os.fstat(file.fileno()).st_size
+            for index, (at, size) in enumerate(
+                zip(self._track.offsets.tolist(), self._track.sizes.tolist(), strict=True)
+            ):
+                if size > _MOST_PAYLOAD_BYTES or at + size > end:
+                    self._damaged += 1
+                    continue
+                file.seek(at)
+                streams, whole = read_streams(file.read(size))
+                self._damaged += not whole
+                yield index, streams
 
     def _count(self, index: int, streams: list[Stream]) -> None:
         for key in _KEYS:

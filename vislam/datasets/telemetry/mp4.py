@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
-from vislam.core.reading import open_file
+from vislam.core.reading import open_file, opened
 
 Integers = NDArray[np.int64]
 
@@ -95,26 +95,23 @@ def frame_times_ns(path: Path) -> Integers:
 
 def _read_moov(path: Path) -> memoryview:
     """Return the body of the file's `moov`."""
-    try:
-        with open_file(path) as file:
-            end = os.fstat(file.fileno()).st_size
-            at = 0
-            for _ in range(_MOST_BOXES):
-                file.seek(at)
-                head = file.read(16)
-                if len(head) < 8:
-                    break
-                length, begins = _length(head, end - at)
-                if not begins <= length <= end - at:
-                    break
-                if head[4:8] == b"moov":
-                    if length > _MOST_HEADER_BYTES:
-                        raise DataError(f"{path}: a header of {length} bytes is larger than any sensible one")
-                    file.seek(at + begins)
-                    return memoryview(file.read(length - begins))
-                at += length
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    with opened(path) as file:
+        end = os.fstat(file.fileno()).st_size
+        at = 0
+        for _ in range(_MOST_BOXES):
+            file.seek(at)
+            head = file.read(16)
+            if len(head) < 8:
+                break
+            length, begins = _length(head, end - at)
+            if not begins <= length <= end - at:
+                break
+            if head[4:8] == b"moov":
+                if length > _MOST_HEADER_BYTES:
+                    raise DataError(f"{path}: a header of {length} bytes is larger than any sensible one")
+                file.seek(at + begins)
+                return memoryview(file.read(length - begins))
+            at += length
     raise DataError(f"{path} has no MP4 header (moov): it is cut off or something else; copy the file again")
 
 

@@ -149,16 +149,13 @@ def encode(message: RawSample | Hello | Counts | Passed | Ages | Spent) -> bytes
         body = _SAMPLE.pack(SAMPLE_TYPE, m.sequence, m.t_us, m.status, *m.accel, *m.gyro, *m.mag, m.temperature)
     elif isinstance(message, Passed):
         body = _PASSED.pack(PASSED_TYPE, message.sequence, message.t_us) + message.data
-    elif isinstance(message, Hello):
-        h = message
-        body = _HELLO.pack(
-            HELLO_TYPE, h.sequence, h.t_us, PROTOCOL_VERSION, h.chips, h.accel_id, h.gyro_id, h.mag_id, h.rate_hz,
-            h.accel_nm_s2, h.gyro_nrad_s, h.mag_pt, h.temperature_nk, h.temperature_mc,
-            h.accel_limit, h.gyro_limit, h.mag_limit,
-        )  # fmt: skip
     else:
-        kind = next(kind for kind, (of, _) in _PLAIN.items() if isinstance(message, of))
-        body = _PLAIN[kind][1].pack(kind, *(getattr(message, field.name) for field in fields(message)))
+        sequence, t_us, *rest = (getattr(message, field.name) for field in fields(message))
+        if isinstance(message, Hello):
+            body = _HELLO.pack(HELLO_TYPE, sequence, t_us, PROTOCOL_VERSION, *rest)
+        else:
+            kind = next(kind for kind, (of, _) in _PLAIN.items() if isinstance(message, of))
+            body = _PLAIN[kind][1].pack(kind, sequence, t_us, *rest)
     return stuff(body + _CRC.pack(binascii.crc_hqx(body, _CRC_BEGIN))) + b"\0"
 
 

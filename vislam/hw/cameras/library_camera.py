@@ -73,20 +73,13 @@ class LibraryCamera(Generic[Shot]):
     `read` never waits for the library. A camera that goes away is looked for every `config.reopen_s`.
     """
 
-    def __init__(
-        self,
-        name: str,
-        open_stream: Callable[[], Stream[Shot]],
-        config: LibraryCameraConfig,
-        must_be_there: bool = True,
-    ) -> None:
+    def __init__(self, name: str, open_stream: Callable[[], Stream[Shot]], config: LibraryCameraConfig) -> None:
         """Open the camera and wait for its first shot, `config.start_s` at most.
 
         Args:
             name: for messages.
             open_stream: opens the camera, again and again; HardwareError, or what the library raises, if it cannot.
             config: rate and times.
-            must_be_there: otherwise nothing is waited for, and a missing camera is no error.
 
         Raises:
             HardwareError: there is no such camera, or it gives no image.
@@ -106,11 +99,10 @@ class LibraryCamera(Generic[Shot]):
         self._has_tried = threading.Event()  # a shot came, or the camera could not be opened
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
-        if must_be_there:
-            self._has_tried.wait(config.start_s)
-            if self._newest_ns == 0:
-                self.close()
-                raise HardwareError(self.problem or f"{name} gives no image within {config.start_s:g} s; replug it")
+        self._has_tried.wait(config.start_s)
+        if self._newest_ns == 0:
+            self.close()
+            raise HardwareError(self.problem or f"{name} gives no image within {config.start_s:g} s; replug it")
 
     def read(self, timeout_s: float) -> Shot | None:
         """Return the newest shot not yet returned, waiting at most `timeout_s`; None if none came."""

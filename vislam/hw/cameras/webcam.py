@@ -43,12 +43,7 @@ class Webcam(LibraryCamera[CapturedImage]):
     without any stamps arrivals less as much have to do. `stamped_by` names which.
     """
 
-    def __init__(
-        self,
-        config: WebcamConfig,
-        must_be_there: bool = True,
-        open_capture: Callable[[str], Capture] | None = None,
-    ) -> None:
+    def __init__(self, config: WebcamConfig, open_capture: Callable[[str], Capture] | None = None) -> None:
         """Open the camera and wait for its first image, see `LibraryCamera`.
 
         `open_capture` opens a device file; OpenCV does it by default.
@@ -58,7 +53,7 @@ class Webcam(LibraryCamera[CapturedImage]):
         """
         path, opened, known = device_path(config.device), open_capture or _open_v4l2, _Known(config)
         self._left_out = known.left_out
-        super().__init__(path, lambda: WebcamStream(path, config, opened, known), config, must_be_there)
+        super().__init__(path, lambda: WebcamStream(path, config, opened, known), config)
 
     def counters(self) -> dict[str, int]:
         """Return images captured, replaced or left out, each by its cause, and faults since the start."""

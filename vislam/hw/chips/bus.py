@@ -146,7 +146,7 @@ class I2cBus:
                     raise self._failed(f"read of register 0x{register:02x} at 0x{address:02x}", error) from error
         return False
 
-    def measure_hz(self, address: int, register: int, clock: Clock, repeats: int = 20) -> float:
+    def measure_hz(self, address: int, register: int, clock: Clock) -> float:
         """Return the clock of the bus in Hz, from the time that 31 bytes more take; they cost 9 bits each.
 
         Reads 32 registers from `register` on, which reading must not change. Raises BusError when none can be read.
@@ -155,7 +155,7 @@ class I2cBus:
         for length in (1, 32):
             read = self.prepare([(address, register, length)])
             durations = []
-            for _ in range(repeats):
+            for _ in range(20):
                 start = clock.now_ns()
                 with suppress(BusError):
                     read.run()

@@ -169,6 +169,6 @@ def next_of(asked: float, offered: dict[int, int]) -> int:
     return min((value for value in offered if value >= asked), default=max(offered))
 
 
-def divided(asked_hz: float, base_hz: float, most: int = 256) -> int:
-    """Return by what `base_hz` is divided, 1 to `most`, for a rate that is not below what is asked for."""
-    return max(min(int(base_hz / asked_hz), most), 1)
+def divided(asked_hz: float, base_hz: float) -> int:
+    """Return by what `base_hz` is divided, 1 to 256, for a rate that is not below what is asked for."""
+    return max(min(int(base_hz / asked_hz), 256), 1)

@@ -40,6 +40,7 @@ _LATE_NS = 20_000_000
 _MOST_ASIDE_NS = 5 * _NS  # for which its thread may be put aside without loss: the samples come late
 _HELLO_EVERY_NS = _NS
 _READ_NS = 500_000  # from a sample's time to its first byte
+_WIRE_NS = SAMPLE_WIRE_BYTES * 10 * _NS // 500_000  # that a frame is on its way, at 500 kBaud
 _BOOT_NS = 120_000_000
 _SEQUENCES, _WRAP_US = 2**16, 2**32
 NOISE = (  # per sqrt(Hz), of gyro, accelerometer and magnetometer
@@ -86,11 +87,7 @@ def bridged(name: BridgedName) -> Bridged:
     if name == "GY-85":
         return _GY85
     if name == "stranger":
-        h = _GY85.hello
-        hello = Hello(
-            0, 0, Chips(0), _STRANGER, 0, b"\0\0\0", h.rate_hz, h.accel_nm_s2, h.gyro_nrad_s, h.mag_pt,
-            h.temperature_nk, h.temperature_mc, h.accel_limit, h.gyro_limit, h.mag_limit,
-        )  # fmt: skip
+        hello = replace(_GY85.hello, chips=Chips(0), accel_id=_STRANGER, gyro_id=0, mag_id=b"\0\0\0")
         return Bridged(hello, None, 0, 0, 0, 4095, -4096, 1)
     who, is_first, has_mag = _WHO_AM_I[name], name == "MPU-6050", name in ("MPU-9250", "MPU-9255")
     mag_id, mag_pt, mag_limit, mag_us = (
@@ -134,8 +131,6 @@ class BridgeEmulator:
         seed: int = 0,
         drift: float = 0.0,
         errors: tuple[SensorError, SensorError, SensorError] = NOISE,
-        baud: int = 500_000,
-        now_ns: Callable[[], int] = time.monotonic_ns,
         turned: Callable[[int], tuple[float, float]] | None = None,
         has_receiver: bool = False,
         board: BridgedName = "GY-85",
@@ -148,8 +143,6 @@ class BridgeEmulator:
             seed: of noise and faults.
             drift: of the device's clock, relative; 0.02 runs fast.
             errors: of gyro, accelerometer and magnetometer; the noise of the data sheets by default.
-            baud: sets how long a frame is on its way; the terminal itself has no rate.
-            now_ns: the clock that truth and bytes follow.
             turned: by how many counts left and right wheel have turned at a time; None: a sketch without encoders.
             has_receiver: the sketch passes on what `say` is given.
             board: what is behind it, see `bridged`.
@@ -158,8 +151,6 @@ class BridgeEmulator:
         self.faults = LineFaults()
         self._truth = truth
         self._drift = drift
-        self._wire_ns = SAMPLE_WIRE_BYTES * 10 * _NS // baud
-        self._now_ns = now_ns
         self._turned = turned
         self._board = bridged(board)
         self._chips = self._board.hello.chips | (Chips.ENCODERS if turned else 0) | (Chips.GNSS if has_receiver else 0)
@@ -231,8 +222,8 @@ class BridgeEmulator:
     def _run(self) -> None:
         while not self._is_stopping.is_set():
             self._restart_asked.clear()
-            if self._waited_until(self._now_ns() + _BOOT_NS):
-                self._run_from(self._now_ns())
+            if self._waited_until(time.monotonic_ns() + _BOOT_NS):
+                self._run_from(time.monotonic_ns())
 
     def _run_from(self, begin_ns: int) -> None:
         """Sample and send as the sketch does, until the board is to restart."""
@@ -250,16 +241,16 @@ class BridgeEmulator:
                     sequence, chips = (sequence + 1) % _SEQUENCES, self._chips
             sample = self._sample(sequence, self._device_us(due_ns - begin_ns), due_ns, ticks)
             sequence, ticks = (sequence + 1) % _SEQUENCES, ticks + 1
-            if not self._waited_until(due_ns + _READ_NS + self._wire_ns):
+            if not self._waited_until(due_ns + _READ_NS + _WIRE_NS):
                 return
             frames += encode(sample)
             with self._lock:
                 said, self._said = self._said[:MOST_PASSED], self._said[MOST_PASSED:]
             frames += further.counts(due_ns, self._device_us(due_ns - begin_ns), ticks)
-            taken_ns = min(self._now_ns(), due_ns + _LATE_NS)  # of a thread that was put aside: near its samples
+            taken_ns = min(time.monotonic_ns(), due_ns + _LATE_NS)  # of a thread that was put aside: near its samples
             self._send(frames + further.passed(self._device_us(taken_ns - begin_ns), said))
             due_ns += _PERIOD_NS
-            aside = max(self._now_ns() - due_ns - _MOST_ASIDE_NS, 0) // _PERIOD_NS  # the board would have gone on
+            aside = max(time.monotonic_ns() - due_ns - _MOST_ASIDE_NS, 0) // _PERIOD_NS  # the board would have gone on
             due_ns, sequence, ticks = due_ns + aside * _PERIOD_NS, (sequence + aside) % _SEQUENCES, ticks + aside
 
     def _device_us(self, elapsed_ns: int) -> int:
@@ -303,10 +294,10 @@ class BridgeEmulator:
 
     def _waited_until(self, t_ns: int) -> bool:
         """Return at a time, or earlier with False when the board is to stop or to restart."""
-        left_s = (t_ns - self._now_ns()) / _NS
+        left_s = (t_ns - time.monotonic_ns()) / _NS
         while left_s > 0.0 and not self._interrupted():
             time.sleep(min(left_s, 0.05))
-            left_s = (t_ns - self._now_ns()) / _NS
+            left_s = (t_ns - time.monotonic_ns()) / _NS
         return not self._interrupted()
 
     def _interrupted(self) -> bool:

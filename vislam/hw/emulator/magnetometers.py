@@ -1,9 +1,10 @@
 """Virtual HMC5883L (or DA5883), QMC5883L, QMC5883P, LIS3MDL, AK09916 and AK8963."""
 
 import struct
-from typing import Protocol
 
 from vislam.hw.emulator.chips import Chip, NowNs
+from vislam.hw.emulator.icm20948 import VirtualIcm20948
+from vislam.hw.emulator.mpu6050 import VirtualMpu6050
 from vislam.hw.emulator.sensing import IDEAL, SensorError, Triple, Truth, quantised
 
 _UT_PER_GA = 100.0
@@ -194,13 +195,6 @@ class VirtualLis3mdl(_Sampling):
             self.registers[0x27] = 0
 
 
-class _Around(Protocol):
-    """A chip with a magnetometer inside, which is on the bus or not."""
-
-    @property
-    def lets_through(self) -> bool: ...
-
-
 class VirtualAkm(_Sampling):
     """AK09916 ("AK09916") or AK8963 inside another chip: silent until that lets the bus through.
 
@@ -214,7 +208,7 @@ class VirtualAkm(_Sampling):
         error: SensorError = IDEAL,
         seed: int = 0,
         variant: str = "AK09916",
-        around: _Around | None = None,
+        around: VirtualMpu6050 | VirtualIcm20948 | None = None,
         fuses: tuple[int, int, int] = (176, 178, 166),
     ) -> None:
         """Take the motion, the host's clock and the errors, in axes of the chip around; `fuses` of an AK8963."""

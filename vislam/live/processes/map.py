@@ -133,11 +133,8 @@ class _LiveRun(Run):
 
     def go_on_from(self, beginning: Beginning) -> None:
         """Go on in the run's own session, whose map is the one to be found again: the cart may stand elsewhere."""
-        stored = Session(beginning.session)
-        try:
+        with Session(beginning.session) as stored:
             self.go_on(stored)
-        finally:
-            stored.close()
         self.base = {"path": str(beginning.session), "keyframes": beginning.first_id, "localize_only": False}
 
     def _finish(self, start: float, is_brief: bool) -> dict[str, Any]:

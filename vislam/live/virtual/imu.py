@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from vislam.config import Gy85Config, SensorsConfig
 from vislam.core.errors import HardwareError
@@ -21,7 +20,7 @@ from vislam.hw.sensors import open_inertial
 from vislam.hw.timing import Clock, HostClock
 from vislam.live.epoch import Epoch
 from vislam.live.processes.child import Life
-from vislam.live.virtual.motion import SEGMENT_S, Follower, Segment
+from vislam.live.virtual.motion import SEGMENT_S, Drive, Follower
 
 _NS = 1_000_000_000
 _FIELD_UT = (18.2, -10.5, -43.0)  # central Europe, z up
@@ -32,19 +31,11 @@ _POLL_S = 0.005
 _CLOSING_S = 30.0  # that the port's reader may take to end
 
 
-class Moved(Protocol):
-    """The motion of a cart, as far as it was decided."""
-
-    def segment(self, t_s: float) -> Segment:
-        """Return the segment of a time since the beginning."""
-        ...
-
-
 class VirtualGy85(Gy85):
     """A GY-85 on a cart; unplugged in each of `outages`."""
 
     def __init__(
-        self, cart: Moved, begin_ns: Callable[[], int], config: Gy85Config, seed: int, gravity_m_s2: float,
+        self, cart: Drive | Follower, begin_ns: Callable[[], int], config: Gy85Config, seed: int, gravity_m_s2: float,
         outages: tuple[tuple[float, float], ...] = (), stepped: SteppedClock | None = None,
     ) -> None:  # fmt: skip
         """Put a board on a cart, and open it with the driver.
@@ -136,7 +127,7 @@ class _Outages:
         return since_s < self._until_s
 
 
-def _truth(cart: Moved, begin_ns: Callable[[], int], gravity_m_s2: float) -> Truth:
+def _truth(cart: Drive | Follower, begin_ns: Callable[[], int], gravity_m_s2: float) -> Truth:
     """Return what chips on the cart sense at a time: a body above the middle of the axle, level."""
 
     def at(t_ns: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:

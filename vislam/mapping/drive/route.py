@@ -31,15 +31,9 @@ _HOLE_CELLS = 2  # unseen cells across within seen ones: rays miss some
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
-    """A way through the map.
+    """A way through the map."""
 
-    Attributes:
-        corners_m: [N, 2] of a line in the map frame; first and last are the ends.
-        cost_m: its length, dearer where there is little room or nothing was seen.
-    """
-
-    corners_m: Array
-    cost_m: float
+    corners_m: Array  # [N, 2] of a line in the map frame; first and last are the ends
 
     @property
     def length_m(self) -> float:
@@ -102,7 +96,7 @@ def plan(grid: DriveGrid, start_m: Array, goal_m: Array, explores: bool = False)
     places = np.stack([cells % cost.shape[1], cells // cost.shape[1]], axis=1) + 0.5
     kept = places[_straightened(cost, places, so_far)] * grid.resolution_m + grid.origin_m
     kept[0], kept[-1] = start_m, goal_m
-    return Route(kept, float(so_far[-1]) * grid.resolution_m)
+    return Route(kept)
 
 
 def _costs(grid: DriveGrid, start: tuple[int, int], goal: tuple[int, int], explores: bool) -> Array:

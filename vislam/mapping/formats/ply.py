@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.files import replacing
-from vislam.core.reading import open_file
+from vislam.core.reading import opened
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
@@ -118,17 +118,14 @@ def read_rows(path: Path, read_header: Callable[[BinaryIO, Path], tuple[int, np.
     The header's reader leaves the file where the rows begin. Raises DataError when the file cannot be read or is cut
     short, before memory is taken.
     """
-    try:
-        with open_file(path) as file:
-            count, point = read_header(file, path)
-            available = path.stat().st_size - file.tell()
-            if count * point.itemsize > available:
-                raise DataError(
-                    f"{path} is cut: it promises {count} points of {point.itemsize} bytes, {available} bytes follow"
-                )
-            return np.fromfile(file, point, count)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    with opened(path) as file:
+        count, point = read_header(file, path)
+        available = path.stat().st_size - file.tell()
+        if count * point.itemsize > available:
+            raise DataError(
+                f"{path} is cut: it promises {count} points of {point.itemsize} bytes, {available} bytes follow"
+            )
+        return np.fromfile(file, point, count)
 
 
 def _read_face_header(file: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:

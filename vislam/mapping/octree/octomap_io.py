@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vislam.core.errors import DataError
 from vislam.core.jit import njit
-from vislam.core.reading import read_bytes
+from vislam.core.reading import read_bytes, readable
 from vislam.mapping.octree.tree import TREE_LEVELS, OctreeLeaves, log_odds
 
 _BINARY_TITLE = b"# Octomap OcTree binary file"
@@ -71,10 +71,8 @@ def read_octree(path: Path, occupied_probability: float = 0.971, free_probabilit
     nodes: another number in its header is logged as a warning. Raises DataError when the file is not a
     complete tree of kind OcTree or ColorOcTree. Memory is bounded by the file's size.
     """
-    try:
+    with readable(path):
         content = read_bytes(path, _MAX_FILE_BYTES)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
     is_binary, fields, offset = _parse_header(content, path)
     kind, resolution_m, size = _checked_header(fields, path)
     if not is_binary:

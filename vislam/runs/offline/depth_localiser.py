@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from vislam.core.errors import DataError, UsageError
-from vislam.factors import rig_from
 from vislam.mapping.depth.localise import DepthLocaliser
 from vislam.mapping.depth.stored import stored_depth
 from vislam.runs.levelled import stored_level
@@ -21,10 +20,9 @@ def depth_localiser(run: Path | str) -> DepthLocaliser:
         DataError: the session is missing, damaged, or holds no depth images.
         UsageError: the run had no depth camera, or made no map.
     """
-    session = Session(Path(run) / "session.db")
-    try:
+    with Session(Path(run) / "session.db") as session:
         info, config = session.info(), session.config()
-        rig = rig_from(info["rig"])
+        rig = session.rig()
         if not rig.has_depth or not config.map.enabled:
             raise UsageError(
                 f"{run} keeps no depth images: its camera has to measure depth, and `--map.enabled` has to be on"
@@ -33,8 +31,6 @@ def depth_localiser(run: Path | str) -> DepthLocaliser:
         poses = {k.id: T_level_map @ k.T_map_body for k in session.keyframes() if submaps.group(k.id) == 0}
         scans = {k: scan for k, scan in session.scans().items() if k in poses}
         localiser, _ = stored_depth(rig, config.map, scans, poses)
-    finally:
-        session.close()
     if not len(localiser):
         raise DataError(f"{run} holds no depth image of a keyframe; run the recording again")
     return localiser

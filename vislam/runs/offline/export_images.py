@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vislam.core.camera import Camera
-from vislam.core.errors import DataError, StorageError, UsageError
-from vislam.core.files import partial_folder, write_json, write_text
+from vislam.core.errors import DataError, UsageError
+from vislam.core.files import partial_folder, storage, write_json, write_text
 from vislam.core.geometry import invert, quaternion_wxyz
 from vislam.core.messages import Array, Frame
 from vislam.core.progress import Progress, silent
@@ -92,10 +92,8 @@ def export_images(
 def _new_folders(paths: list[Path]) -> Iterator[list[Path]]:
     """Make folders that appear under their names when the block ends well, and not at all when it does not."""
     for path in paths:
-        try:
+        with storage(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"{path.parent} cannot be made: {error.strerror}; choose another folder") from error
     with ExitStack() as stack:
         made = [stack.enter_context(partial_folder(path)) for path in paths]
         yield made

@@ -19,7 +19,6 @@ from vislam.core.errors import DataError, UsageError
 from vislam.core.files import partial_folder
 from vislam.core.geometry import invert_many
 from vislam.core.messages import Array, NavState
-from vislam.factors import rig_from
 from vislam.mapping.drive.grid import read_grid
 from vislam.mapping.formats.ply import read_ply
 from vislam.runs.loaded import KeyframeStates, LoadedRun, load_run
@@ -147,13 +146,8 @@ def _rig(run: Path) -> Rig | str:
     """Return the cameras of a run, or why they are not known."""
     if not (run / "session.db").is_file():
         return f"{run / 'session.db'}, which holds the cameras' poses, is not there"
-    session = Session(run / "session.db")
-    try:
-        return rig_from(session.info()["rig"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{session.path} has no cameras that can be read: {error}; run the recording again") from error
-    finally:
-        session.close()
+    with Session(run / "session.db") as session:
+        return session.rig()
 
 
 def _write_poses(topics: _Topics, loaded: LoadedRun, poses: Trajectory, frame: str) -> None:
@@ -191,11 +185,8 @@ def _motions(loaded: LoadedRun) -> dict[int, Array]:
     keyframes = loaded.states.get("ekf")
     found = {} if keyframes is None else {state.t_ns: motion_of(state) for state in _as_states(keyframes)}
     if (path := loaded.folder / "session.db").is_file():
-        session = Session(path)
-        try:
+        with Session(path) as session:
             found |= {frame.t_ns: frame.motion for frame in session.frames() if frame.motion is not None}
-        finally:
-            session.close()
     return found
 
 

@@ -16,14 +16,13 @@ from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
 from vislam.core.errors import TrackingLostError, UsageError
-from vislam.core.files import write_json, write_lines
+from vislam.core.files import storage, write_json, write_lines
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, GraphUpdate, Submaps
 from vislam.core.progress import Progress, silent
 from vislam.factors import LoopModel, loop_record
 from vislam.graph.joining import JOIN_FRAMES, RelativeCovariance, Waiting
 from vislam.loop import LoopCloser
-from vislam.runs.folder import storage
 from vislam.runs.offline.session_graph import (
     Edges,
     SessionPart,

@@ -12,7 +12,6 @@ from vislam.config import LoopTruthConfig
 from vislam.core.errors import DataError
 from vislam.core.files import csv_text, write_json, write_text
 from vislam.core.messages import Array, LoopDecision, RetrievedKeyframe
-from vislam.factors import rig_from
 from vislam.loop import (
     DOUBTFUL,
     RIGHT,
@@ -127,17 +126,12 @@ def summarise(judged: JudgedLoops, rule: LoopTruthConfig) -> dict[str, Any]:
 
 def _places(session_path: Path, truth: Trajectory, rule: LoopTruthConfig) -> TruePlaces:
     """Return the keyframes that the truth covers."""
-    session = Session(session_path)
-    try:
-        rig = rig_from(session.info()["rig"])
+    with Session(session_path) as session:
+        rig = session.rig()
         if rig.is_blind:
             raise DataError(f"{session_path}: the run had no camera, so that there are no loops to judge")
         first_id = session.first_id  # the truth of older recordings, in whose map a run begins, is not at hand
         stored = [keyframe for keyframe in session.keyframes() if keyframe.id >= first_id]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{session_path} is damaged ({error}); run the recording again") from error
-    finally:
-        session.close()
     t_ns = np.array([keyframe.t_ns for keyframe in stored], dtype=np.int64)
     poses = np.array([keyframe.T_map_body for keyframe in stored]).reshape(-1, 4, 4)
     pairs = associate(Trajectory(t_ns, poses), truth, max_gap_s=rule.max_truth_gap_s)
@@ -195,8 +189,7 @@ def _rescored(
     wanted = asked | {found.from_id for found in retrieved}
     bags: dict[int, BagOfWords] = {}
     expected: dict[int, float] = {}
-    session = Session(session_path)
-    try:
+    with Session(session_path) as session:
         trained = session.words()
         words = seed_vocabulary() if trained is None else Vocabulary.from_bytes(trained.data, f"of {session_path}")
         before: BagOfWords | None = None
@@ -207,8 +200,6 @@ def _rescored(
             if keyframe.id in asked and before is not None:
                 expected[keyframe.id] = bag.score(before)
             before = bag
-    finally:
-        session.close()
     known = [found for found in retrieved if found.from_id in bags and found.to_id in bags]
     alike = [replace(found, score=bags[found.from_id].score(bags[found.to_id])) for found in known]
     return alike, [

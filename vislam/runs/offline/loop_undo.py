@@ -36,11 +36,8 @@ def list_loops(run: Path) -> list[dict[str, Any]]:
     Keys: id, from, to, decision, chi2, weight, reason; numbers that are not known are None. Raises DataError for what
     is no run or is damaged.
     """
-    session = Session(_session(run))
-    try:
+    with Session(_session(run)) as session:
         loops = session.loops()
-    finally:
-        session.close()
     rows = read_loops(run / "loops.csv") if (run / "loops.csv").is_file() else []  # a run that was killed has none
     weights = {(row.from_id, row.to_id): row.weight for row in rows if row.was_offered}
     return [_line(loop, weights.get((loop.edge.from_id, loop.edge.to_id), math.nan)) for loop in loops]
@@ -65,8 +62,7 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
     Everything is computed before anything is written. Returns what moved and what was written. Raises UsageError for
     edges that cannot be changed so, DataError for what is no run or is damaged.
     """
-    session = Session(_session(run))
-    try:
+    with Session(_session(run)) as session:
         info, config, memory = session.info(), session.config(), recall(session)
         if memory is None:
             raise DataError(f"{run} has no keyframe with gravity yet; there is nothing to optimise")
@@ -76,8 +72,6 @@ def change_loops(run: Path, undo: Sequence[int], redo: Sequence[int]) -> dict[st
         memory = replace(memory, graph=replace(memory.graph, loops=changed))
         log = RunLog()
         log.restore(session, memory)
-    finally:
-        session.close()
     redone = _optimise(config, info, memory)
     asked = {*undo, *redo}
     states = {state.id: state for state in redone.record.loops}

@@ -20,8 +20,8 @@ from vislam.batch.posegraph.solver import Progress
 from vislam.batch.posegraph.uncertainty import Uncertainty, uncertainty_if_any
 from vislam.config import PoseGraphConfig
 from vislam.core.collector import paused
-from vislam.core.errors import StorageError, UsageError
-from vislam.core.files import write_json, write_lines
+from vislam.core.errors import UsageError
+from vislam.core.files import storage, write_json, write_lines
 from vislam.core.geometry import quaternion_xyzw_from_rotation
 from vislam.core.messages import Array
 from vislam.trajectory import Trajectory, write_kitti, write_tum
@@ -66,7 +66,8 @@ def optimize_graph_file(
     if config.noise and not config.rescale_noise:
         uncertainty = uncertainty or uncertainty_if_any(problem, solution.poses, solution.weights)
         noise = _noise(problem, solution, None if uncertainty is None else uncertainty.factor)
-    make_folder(out)
+    with storage(out):
+        out.mkdir(parents=True, exist_ok=True)
     write_g2o(problem, out / "optimized.g2o", solution.poses)
     _write_trajectories(problem, solution.poses, out)
     _write_edges(problem, solution, out / "edges.csv")
@@ -135,14 +136,6 @@ def certificate_entry(certificate: Certificate) -> dict[str, Any]:
     """Return a certificate for summary.json; what could not be computed is None."""
     entry = {f.name: getattr(certificate, f.name) for f in fields(certificate) if f.name != "better"}
     return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in entry.items()}
-
-
-def make_folder(out: Path) -> None:
-    """Make a folder for results. Raises StorageError."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"{out} cannot be made: {error.strerror or error}; choose another --out") from error
 
 
 def summarise(problem: PoseGraphProblem, solution: PoseGraphSolution) -> dict[str, Any]:

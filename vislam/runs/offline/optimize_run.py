@@ -72,13 +72,10 @@ def _check(run: Path, name: str) -> None:
 
 def _read(run: Path, config: BatchConfig) -> tuple[FactorLog, Config, Levelled]:
     """Return the factor log, the settings (of those stored, the ones that this version knows), and which way is up."""
-    session = Session(run / "session.db")
-    try:
+    with Session(run / "session.db") as session:
         info = session.info()
         stored, level = info.get("config"), stored_level(info)
         log = session.factor_log()
-    finally:
-        session.close()
     data: dict[str, Any] = {"batch": asdict(config)}
     for section in _SECTIONS:
         known = {f.name for f in fields(getattr(Config(), section))}

@@ -13,7 +13,6 @@ from vislam.config import FrontEndConfig
 from vislam.core.camera import Camera, Rig
 from vislam.core.errors import DataError
 from vislam.core.messages import Array, KeyframePacket
-from vislam.factors import rig_from
 from vislam.mapping.semantic.images import camera_t_ns
 from vislam.runs.levelled import stored_level
 from vislam.runs.offline.rebuild import keyframe_poses, stored_submaps
@@ -77,17 +76,14 @@ def posed_images(run: Path, poses: str = "graph") -> PosedImages:
 
     Raises UsageError for a trajectory that is not there, DataError when the session cannot be used.
     """
-    session = Session(run / "session.db")
-    try:
+    with Session(run / "session.db") as session:
         info = session.info()
-        rig, config = rig_from(info["rig"]), session.config().frontend
+        rig, config = session.rig(), session.config().frontend
         if rig.is_blind:
             raise DataError(f"{run} was run without a camera: it has no images")
         placed = keyframe_poses(session, run, poses, stored_level(info).T_level_map)
         packets = [p for p in session.packets() if p.keyframe.id in placed and len(p.observations.track_ids)]
         submaps = stored_submaps(session)
-    finally:
-        session.close()
     groups = [submaps.group(p.keyframe.id) for p in packets]
     largest = max(groups, key=groups.count, default=0)
     joined = [p for p, group in zip(packets, groups, strict=True) if group == largest]

@@ -21,7 +21,6 @@ from vislam.core.memory import LoopPlace, PackedScan
 from vislam.core.messages import Array, Frame, GraphUpdate, Keyframe, Submaps
 from vislam.core.progress import Progress, silent
 from vislam.core.up import Up
-from vislam.factors import rig_from
 from vislam.frontend import knows_scale, mode_for
 from vislam.mapping.cloud.store import packed_labels
 from vislam.mapping.depth.extract import ScanExtractor
@@ -44,11 +43,8 @@ _EXTRACTION = (
 
 def map_settings(run: Path) -> Config:
     """Return the settings of a run; raises DataError when its session cannot be read."""
-    session = Session(run / "session.db")
-    try:
+    with Session(run / "session.db") as session:
         return session.config()
-    finally:
-        session.close()
 
 
 def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress: Progress = silent) -> dict[str, Any]:
@@ -57,11 +53,10 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
     `poses` is "graph" for the run's own, or names a `trajectory_NAME.tum` in its folder. Raises UsageError for a
     trajectory that is not there, DataError when the session or the recording cannot be used.
     """
-    session = Session(run / "session.db")
-    try:
+    with Session(run / "session.db") as session:
         info = session.info()
         ran = session.config()
-        rig = rig_from(info["rig"])
+        rig = session.rig()
         if rig.is_blind:
             raise DataError(f"{run} was run without a camera: there is nothing to make a map of")
         level = stored_level(info)
@@ -82,11 +77,13 @@ def rebuild(run: Path, config: MapConfig, out: Path | None, poses: str, progress
             progress(done, total, note)
 
         if from_session:
-            _from_session(session, mapper, placed, nothing, config.rebuild_keyframes_per_call, labels, report)
+            scans = {i: scan for i, scan in session.scans().items() if i in placed}
+            mapper.restore(labels.given(scans, session), placed)
+            for done in range(0, len(scans), config.rebuild_keyframes_per_call):
+                report(done, "octree")
+                mapper.move(nothing)
         else:
             _from_recording(session, mapper, placed, read_setup(run)[0], ran, labels, report)
-    finally:
-        session.close()
     mapper.finish()
     if info.get("first_state") is None:
         level, mapper, placed = _levelled(level, mapper, placed, ran)
@@ -202,22 +199,6 @@ class _Labels:
             on_rays = None if labels is None else self._extractor.on_rays(labels)
             out[i] = replace(scan, labels_png=packed_labels(on_rays))
         return out
-
-
-def _from_session(
-    session: Session,
-    mapper: Mapper,
-    placed: dict[int, Array],
-    nothing: GraphUpdate,
-    at_once: int,
-    labels: _Labels,
-    report: Callable[[int, str], None],
-) -> None:
-    scans = {i: scan for i, scan in session.scans().items() if i in placed}
-    mapper.restore(labels.given(scans, session), placed)
-    for done in range(0, len(scans), at_once):
-        report(done, "octree")
-        mapper.move(nothing)
 
 
 def _camera_stamps_ns(session: Session) -> dict[int, int]:

@@ -71,12 +71,9 @@ def read_part(path: Path, name: str) -> SessionPart:
 
     Raises DataError where it is no session, holds no map, or has no scale.
     """
-    session = Session(path / "session.db" if path.is_dir() else path)
-    try:
+    with Session(path / "session.db" if path.is_dir() else path) as session:
         config, memory, log = session.config(), recall(session), session.factor_log()
         rig, first_id = session.info()["rig"], session.first_id
-    finally:
-        session.close()
     if memory is None:
         raise DataError(f"{session.path} holds no map: not one keyframe, or gravity was not found")
     packets = memory.graph.packets

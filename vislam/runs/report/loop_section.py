@@ -6,6 +6,7 @@ from collections import Counter
 
 from vislam.loop import LoopRow, caption
 from vislam.runs.report.html import Cell, card, drawn, escape, folded, grid, note, number, picture, section, table
+from vislam.runs.report.loop_plots import loop_quality
 from vislam.runs.report.run_files import RunFiles, as_dict
 from vislam.runs.report.scene import Scene
 
@@ -45,15 +46,11 @@ def _loop_quality(run: RunFiles) -> str:
     """Return how good the loops are, where `vislam eval RUN --loops` has compared them with the truth."""
     if not run.loops_eval:
         return ""
-    from vislam.runs.report import loop_plots  # matplotlib, which costs a run more than all its other pictures
-
     answer, edges, rule = run.loops_eval, as_dict(run.loops_eval, "edges"), as_dict(run.loops_eval, "rule")
     try:
-        figure = loop_plots.loop_quality(answer)
+        drawings = loop_quality(answer)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         return card(note(f"loops_eval.json cannot be drawn: {type(error).__name__} {error}"))
-    if not figure:
-        return ""
     rows: list[list[str | Cell]] = []
     for name, stage in as_dict(answer, "stages").items():
         low, high = stage["interval"]
@@ -69,7 +66,7 @@ def _loop_quality(run: RunFiles) -> str:
         f"{number(edges.get('gross'), 0)} of {number(edges.get('accepted'), 0)} edges in the graph are off by more "
         f"than {number(rule.get('gross_m'), 1)} m or {number(rule.get('gross_deg'), 0)}°."
     )
-    return card(drawn(figure), table(head, rows), title="Against the truth") + note(text)
+    return card(grid(*map(drawn, drawings)), table(head, rows), title="Against the truth") + note(text)
 
 
 def _loop_pictures(run: RunFiles) -> str:

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vislam.core.files import write_text
-from vislam.runs.folder import storage
+from vislam.core.files import storage, write_text
 from vislam.runs.levelled import up_sentence
 from vislam.runs.report import plots
 from vislam.runs.report.drawing import as_file

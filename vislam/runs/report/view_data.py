@@ -62,11 +62,8 @@ def read_thumbnails(run: RunFiles) -> Thumbnails:
     try:
         if path.stat().st_size > _MAX_SESSION_BYTES:
             return Thumbnails()
-        session = Session(path)
-        try:
+        with Session(path) as session:
             return _of_session(session)
-        finally:
-            session.close()
     except (DataError, OSError, sqlite3.Error, KeyError, TypeError, ValueError) as error:
         run.unread[path.name] = str(error)
         return Thumbnails()

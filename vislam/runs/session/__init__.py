@@ -5,8 +5,8 @@ Arrays are stored as raw little-endian bytes with fixed types; nothing is pickle
 (`recall`), and a batch estimate starts (`Session.factor_log`), without an image.
 """
 
-from vislam.runs.session.reader import Session, StoredEdge, StoredKeyframe, has_begun, has_frames
+from vislam.runs.session.reader import Session, StoredKeyframe, has_begun, has_frames
 from vislam.runs.session.recalling import can_go_on, recall
 from vislam.runs.session.writer import SessionWriter
 
-__all__ = ["Session", "SessionWriter", "StoredEdge", "StoredKeyframe", "can_go_on", "has_begun", "has_frames", "recall"]
+__all__ = ["Session", "SessionWriter", "StoredKeyframe", "can_go_on", "has_begun", "has_frames", "recall"]

@@ -5,6 +5,7 @@ import sqlite3
 import struct
 import zlib
 from collections.abc import Iterable
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -137,10 +138,7 @@ def _objects(db: sqlite3.Connection) -> set[tuple[Any, ...]]:
 
 @cache
 def _known_objects(version: int) -> set[tuple[Any, ...]]:
-    db = sqlite3.connect(":memory:")
-    try:
+    with closing(sqlite3.connect(":memory:")) as db:
         for statement in schema(version).split(";"):
             db.execute(statement)
         return _objects(db)
-    finally:
-        db.close()

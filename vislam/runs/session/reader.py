@@ -2,16 +2,17 @@
 
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vislam.config import Config, from_data, recorded
+from vislam.core.camera import Rig
 from vislam.core.database import connect
 from vislam.core.errors import DataError, UsageError
 from vislam.core.memory import FrameEntry, LoopPlace, LoopState, OfferedLoop, PackedScan, Tie, WordsMemory
@@ -60,29 +61,12 @@ class StoredKeyframe:
     points_body_m: Array | None  # [N, 3]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredEdge:
-    """An accepted loop edge as a session keeps it."""
-
-    id: int
-    from_id: int
-    to_id: int
-    T_from_to: Array  # [4, 4]
-    covariance: Array  # [6, 6]
-    has_scale: bool
-    inliers: int
-
-
 def has_begun(path: Path) -> bool:
     """Return whether a file is there with anything in it; a process that ended at once may have left an empty one."""
     if not path.is_file():
         return False
-    with readable(path):
-        db = connect(path, read_only=True)
-        try:
-            return bool(db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0])
-        finally:
-            db.close()
+    with readable(path), closing(connect(path, read_only=True)) as db:
+        return bool(db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0])
 
 
 def has_frames(path: Path) -> bool:
@@ -119,6 +103,12 @@ class Session:
         with readable(self.path):
             rows = self._db.execute("SELECT key, value FROM info").fetchall()
             return {key: json.loads(value) for key, value in rows}
+
+    def rig(self) -> Rig:
+        """Return the cameras of the run."""
+        info = self.info()
+        with readable(self.path):
+            return rig_from(info["rig"])
 
     def config(self) -> Config:
         """Return the settings of the run; raises DataError when they are damaged, or of another version."""
@@ -166,15 +156,6 @@ class Session:
                     keypoints_px=numbers(row[4], "<f4", (n, 2)),
                     descriptors=descriptors,
                     points_body_m=maybe_numbers(row[6], "<f4", (n, 3)),
-                )
-
-    def edges(self) -> Iterator[StoredEdge]:
-        """Yield the accepted loop edges in order of their ids."""
-        for loop in sorted(self.loops(), key=lambda loop: loop.edge.id):
-            edge = loop.edge
-            if loop.state.decision is LoopDecision.ACCEPTED:
-                yield StoredEdge(
-                    edge.id, edge.from_id, edge.to_id, edge.T_from_to, edge.covariance, edge.has_scale, edge.inliers
                 )
 
     def loops(self) -> list[OfferedLoop]:
@@ -239,7 +220,9 @@ class Session:
             return maybe_numbers(blob, "<f8", (4, 4))
 
         with readable(self.path):
-            motions = {t: numbers(blob, "<f8", (MOTION_NUMBERS,)) for t, blob in self._motion_rows()}
+            has_motions = is_since(self._db, FIRST_WITH_MOTIONS)
+            rows = self._db.execute("SELECT t_ns, numbers FROM motions") if has_motions else ()
+            motions = {t: numbers(blob, "<f8", (MOTION_NUMBERS,)) for t, blob in rows}
             return [
                 FrameEntry(
                     row[0],
@@ -257,9 +240,6 @@ class Session:
                 )
                 for row in self._db.execute("SELECT * FROM frames ORDER BY t_ns")
             ]
-
-    def _motion_rows(self) -> Iterable[tuple[int, bytes]]:
-        return self._db.execute("SELECT t_ns, numbers FROM motions") if is_since(self._db, FIRST_WITH_MOTIONS) else ()
 
     def states(self, whose: str) -> dict[int, NavState]:
         """Return the stored states of keyframes: of the "filter" in odom, or of the "graph"."""
@@ -309,7 +289,7 @@ class Session:
         with readable(self.path):
             noise, first = info["imu_noise"], info.get("first_state")
             return FactorLog(
-                rig=rig_from(info["rig"]),
+                rig=self.rig(),
                 noise=None if noise is None else noise_of(noise),
                 gravity_m_s2=float(info["gravity_m_s2"]),
                 first_state=None if first is None else state_from(first),
@@ -345,3 +325,9 @@ class Session:
     def close(self) -> None:
         """Close the file."""
         self._db.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,6 +1,5 @@
 """A session as the memory that a pipeline goes on from."""
 
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ _RIGID = 1e-4  # how far R R^T may be from identity
 def can_go_on(path: Path) -> bool:
     """Return whether a session file holds something to go on from, as `recall` has it; False for a damaged one."""
     try:
-        with closing(Session(path)) as session:
+        with Session(path) as session:
             return _has_keyframe(session)
     except DataError:
         return False

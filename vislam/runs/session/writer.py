@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any
@@ -84,13 +84,9 @@ class SessionWriter:
         """
         if not path.is_file():
             raise DataError(f"no session at {path}; a run leaves one as session.db")
-        with readable(path):
-            probe = connect(path)  # what a write-ahead log holds is taken in
-        try:
+        with readable(path), closing(connect(path)) as probe:  # what a write-ahead log holds is taken in
             check_sound(probe, path)
             check_records(probe, path)
-        finally:
-            probe.close()
         writer = cls(path, db := _opened(path))
         with storage(path), writer._transaction():
             writer._bring_up()
@@ -309,11 +305,7 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 
 def _start_data(start: StartFacts) -> dict[str, Any]:
-    return {
-        "status": start.status, "reason": start.reason, "last": state_data(start.last),
-        "scale_sigma": start.scale_sigma, "excitation_m_s2": start.excitation_m_s2, "noise": asdict(start.noise),
-        "first_state": state_data(start.first_state), "begun_t_ns": start.begun_t_ns,
-    }  # fmt: skip
+    return {**asdict(start), "last": state_data(start.last), "first_state": state_data(start.first_state)}
 
 
 def _front_data(front: Learned | None) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """What spoils vision: a view without texture, light that jumps, a person who fills part of the image."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -8,6 +10,9 @@ import numpy as np
 from vislam.core.camera import Camera, Rig
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, ImageF32, ImageU8
+
+if TYPE_CHECKING:
+    from vislam.sim.worlds.simulation import SimOptions
 
 PERSON_M = 2.0  # away from the camera
 _SWEEP_S = 7.0  # of the person, to the other side and back
@@ -17,12 +22,15 @@ _SETTLED_S = 0.1  # a camera's control of exposure follows a jump of light withi
 _STAYS = 0.35  # of the jump, in logarithms: what the control of exposure leaves
 
 
-def in_window(t_s: float, begin_s: float, length_s: float, every_s: float = 0.0) -> bool:
-    """Whether a time lies in a window that begins at `begin_s`, and again every `every_s` if that is not 0."""
+def in_window(t_s: float, begin_s: float, length_s: float | None, every_s: float = 0.0) -> bool:
+    """Whether a time lies in a window that begins at `begin_s`, and again every `every_s` if that is not 0.
+
+    Without a length it has no end.
+    """
     after_s = t_s - begin_s
     if every_s > 0.0 and after_s >= 0.0:
         after_s %= every_s
-    return 0.0 <= after_s < length_s
+    return after_s >= 0.0 and (length_s is None or after_s < length_s)
 
 
 def person_box(camera: Camera, share: float, t_s: float) -> Array:
@@ -32,25 +40,11 @@ def person_box(camera: Camera, share: float, t_s: float) -> Array:
     return np.array([[0.5 * camera.width + swing, 0.5 * camera.height], half])
 
 
-@dataclass(frozen=True, slots=True)
-class DisturbanceOptions:
-    """When vision is spoilt and how; times in seconds since the first frame."""
-
-    blank_begin_s: float
-    blank_length_s: float
-    blank_every_s: float
-    light_every_s: float
-    light_stops: float
-    moving_share: float
-    moving_begin_s: float
-    moving_length_s: float
-
-
 class Disturbance:
     """Spoils rendered images."""
 
-    def __init__(self, rig: Rig, options: DisturbanceOptions, seed: np.random.SeedSequence) -> None:
-        """Dress the person, if there is one."""
+    def __init__(self, rig: Rig, options: SimOptions, seed: np.random.SeedSequence) -> None:
+        """Dress the person, if there is one; times of the options are seconds since the first frame."""
         self._rig, self._options = rig, options
         self._cloth: ImageF32 = np.empty((0, 0, 3), dtype=np.float32)
         if options.moving_share > 0.0:

@@ -5,8 +5,9 @@ another landmark and stay there, some jump for a single frame, some are not foun
 the image: a part of it in which everything moves together, but not as the world does.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,12 @@ from vislam.core.camera import Rig
 from vislam.core.geometry import invert
 from vislam.core.messages import Array, Bools, Observations
 from vislam.sim.faults.disturbance import PERSON_M, person_box
-from vislam.sim.motion.spline import Motion
+from vislam.sim.motion.measured import MeasuredMotion
+from vislam.sim.motion.spline import BodySpline
 from vislam.sim.sensing import DepthNoise
+
+if TYPE_CHECKING:
+    from vislam.sim.points.points import PointOptions
 
 Ids = NDArray[np.int64]
 Descriptors = NDArray[np.uint8]
@@ -93,37 +98,14 @@ class Surroundings:
         return self._near
 
 
-@dataclass(frozen=True, slots=True)
-class TrackNoise:
-    """What the simulated tracker does wrong; see `vislam.sim.points.points.PointOptions`."""
-
-    tracks: int
-    pixel_sigma_px: float
-    stereo_sigma_px: float
-    outlier_share: float
-    dropout_share: float
-    track_life_s: float
-    readout_s: float
-    moving_share: float
-    descriptors: bool
-
-
-class Moves(Protocol):
-    """A body whose state is known at any time."""
-
-    def at(self, t_s: Array) -> Motion:
-        """Return the motion at times [N] in seconds."""
-        ...
-
-
 class SimulatedTracker:
     """Follows landmarks from frame to frame; call `see` in order of time."""
 
     def __init__(
-        self, rig: Rig, field: LandmarkField, motion: Moves, noise: TrackNoise, rng: np.random.Generator,
-        first_id: int = 0,
+        self, rig: Rig, field: LandmarkField, motion: BodySpline | MeasuredMotion, noise: PointOptions,
+        rng: np.random.Generator, first_id: int = 0,
     ) -> None:  # fmt: skip
-        """Start without tracks; ids count from `first_id` on."""
+        """Start without tracks, which go wrong as `noise` states; ids count from `first_id` on."""
         self._rig, self._field, self._motion, self._noise, self._rng = rig, field, motion, noise, rng
         self._surroundings = Surroundings(field)
         self._depth_noise = DepthNoise()

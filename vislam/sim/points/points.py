@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from vislam.sim.faults.disturbance import in_window
 from vislam.sim.motion.measured import MeasuredMotion
 from vislam.sim.motion.motions import POINT_WORLDS, vi_sensor_rig, world_motion, world_rig
 from vislam.sim.motion.spline import BodySpline
-from vislam.sim.points.followed import LandmarkField, Moves, SimulatedTracker, TrackNoise
+from vislam.sim.points.followed import LandmarkField, SimulatedTracker
 from vislam.sim.sensing import CONSUMER_IMU, sense_imu
 from vislam.sim.worlds.simulation import TrueStates
 from vislam.sim.worlds.table import WORLDS, surrounded
@@ -45,18 +45,6 @@ _AT_ONCE = 2000  # poses evaluated in one go
 _CHUNK = 4000  # samples made at once
 
 
-class InertialSource(Protocol):
-    """Inertial samples in time order, and the biases in them."""
-
-    def samples(self) -> Iterator[ImuSample]:
-        """Yield the samples; can be called again and yields the same again."""
-        ...
-
-    def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
-        """Return gyro and accelerometer biases [N, 3] at times [N]; NaN where they are unknown."""
-        ...
-
-
 class RecordedImu:
     """The samples of a recording between two stamps, and the next one on either side."""
 
@@ -67,12 +55,12 @@ class RecordedImu:
         self._t_ns, self._gyro, self._accel = t_ns[used], gyro_rad_s[used], accel_m_s2[used]
 
     def samples(self) -> Iterator[ImuSample]:
-        """Yield the samples."""
+        """Yield the samples in time order; can be called again and yields the same again."""
         for t_ns, gyro, accel in zip(self._t_ns.tolist(), self._gyro, self._accel, strict=True):
             yield ImuSample(t_ns, gyro, accel)
 
     def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
-        """Return NaN: they are unknown of a real IMU."""
+        """Return gyro and accelerometer biases [N, 3] at times [N]: NaN, they are unknown of a real IMU."""
         return np.full((len(t_ns), 3), np.nan), np.full((len(t_ns), 3), np.nan)
 
 
@@ -97,13 +85,13 @@ class SimulatedImu:
         self._seeds = seed.spawn(-(-count // _CHUNK))
 
     def samples(self) -> Iterator[ImuSample]:
-        """Yield the samples."""
+        """Yield the samples in time order; can be called again and yields the same again."""
         for t_ns, values in self._pieces():
             for t, row in zip((t_ns + self._zero_ns).tolist(), values, strict=True):
                 yield ImuSample(t, row[:3], row[3:6])
 
     def biases(self, t_ns: Stamps) -> tuple[Array, Array]:
-        """Return the biases in the samples, interpolated."""
+        """Return gyro and accelerometer biases [N, 3] in the samples at times [N], interpolated."""
         known = np.concatenate([values[:, 6:] for _, values in self._pieces()])
         columns = [np.interp(t_ns - self._zero_ns, self._t_ns, column) for column in known.T]
         return np.stack(columns[:3], axis=1), np.stack(columns[3:], axis=1)
@@ -195,8 +183,8 @@ class PointRecording:
         self.options = options = options or PointOptions()
         motion_seed, imu_seed, loss_seed, self._track_seed = np.random.SeedSequence(seed).spawn(4)
         self.problems: dict[str, int] = {}
-        self.motion: Moves
-        self._imu: InertialSource
+        self.motion: BodySpline | MeasuredMotion
+        self._imu: RecordedImu | SimulatedImu
         if isinstance(source, str):
             self._take_world(source, np.random.default_rng(motion_seed), imu_seed)
         else:
@@ -298,13 +286,7 @@ class PointRecording:
         if camera:
             rig = Rig((rig.cameras[camera],), (rig.T_body_cams[camera],))
             seed = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, camera))
-        noise = TrackNoise(
-            tracks=options.tracks, pixel_sigma_px=options.pixel_sigma_px, stereo_sigma_px=options.stereo_sigma_px,
-            outlier_share=options.outlier_share, dropout_share=options.dropout_share,
-            track_life_s=options.track_life_s, readout_s=options.readout_s, moving_share=options.moving_share,
-            descriptors=options.descriptors,
-        )  # fmt: skip
-        return SimulatedTracker(rig, self.field, self.motion, noise, np.random.default_rng(seed), camera << _ID_BITS)
+        return SimulatedTracker(rig, self.field, self.motion, options, np.random.default_rng(seed), camera << _ID_BITS)
 
     def _frames(self) -> Iterator[Frame]:
         options, tracker = self.options, self.tracker()
@@ -316,8 +298,7 @@ class PointRecording:
             if in_window(since_s, options.outage_begin_s, options.outage_length_s, options.outage_every_s):
                 tracks = _nothing(self.true_rig)
             else:
-                length_s = np.inf if options.moving_length_s is None else options.moving_length_s
-                tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, length_s))
+                tracks = tracker.see(t_s, in_window(since_s, options.moving_begin_s, options.moving_length_s))
             others = ((camera, one.see(t_s, moving=False)) for camera, one in further.items())
             seen = tuple(FurtherTracks(camera, one.track_ids, one.pixels_px) for camera, one in others)
             yield Frame(t_ns, index, (), tracks=replace(tracks, further=seen))

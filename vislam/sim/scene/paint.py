@@ -213,15 +213,13 @@ def wood(color: Color = (80, 125, 175), plank_m: float = 0.11, upright: bool = F
     return paint
 
 
-def tiles(
-    color: Color, size_m: float, spread: float = 0.06, joint: Color = (95, 95, 95), grain: float = 0.04
-) -> Painter:
+def tiles(color: Color, size_m: float, spread: float) -> Painter:
     """Square tiles with joints; a few in another colour."""
 
     def paint(rng: np.random.Generator, height: int, width: int, ppm: float) -> ImageU8:
         step = size_m * ppm
         columns, rows = int(width / step) + 2, int(height / step) + 2
-        image = np.full((height, width, 3), joint, dtype=np.uint8)
+        image = np.full((height, width, 3), (95, 95, 95), dtype=np.uint8)
         shift = rng.uniform(0.0, step, 2)
         for row in range(rows):
             for column in range(columns):
@@ -231,7 +229,7 @@ def tiles(
                 own = shade(rng, color, spread if rng.random() > 0.06 else 3.0 * spread)
                 cv2.fillConvexPoly(image, np.round(points * 16).astype(np.int32), own, cv2.LINE_AA, 4)
         chips(rng, image, int(10 * height * width / ppm**2), (0.006 * ppm, 0.025 * ppm), 0.3)
-        grey = noise(rng, height, width, (0.8 * ppm, 0.1 * ppm, 1.0), (0.04, 0.03, grain))
+        grey = noise(rng, height, width, (0.8 * ppm, 0.1 * ppm, 1.0), (0.04, 0.03, 0.04))
         return cv2.multiply(image, cv2.merge([grey, grey, grey]), dtype=cv2.CV_8UC3)
 
     return paint

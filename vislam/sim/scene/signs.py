@@ -219,7 +219,7 @@ def crate(color: Color) -> Painter:
     return paint
 
 
-def door(color: Color, words: str | None = None) -> Painter:
+def door(color: Color) -> Painter:
     """A door with frame, window, handle, number plate and scuffs."""
 
     def paint(rng: np.random.Generator, height: int, width: int, ppm: float) -> ImageU8:
@@ -235,7 +235,7 @@ def door(color: Color, words: str | None = None) -> Painter:
             cv2.rectangle(image, low, high, p.shade(rng, (120, 105, 85), 0.4), -1)
             cv2.line(image, (low[0], high[1]), (high[0], low[1]), (185, 180, 170), max(1, int(0.02 * ppm)), cv2.LINE_AA)
             cv2.rectangle(image, low, high, (50, 50, 55), max(1, int(0.02 * ppm)))
-        plate = sign(_vivid(rng), words)(rng, max(4, int(0.13 * ppm)), max(4, int(0.4 * ppm)), ppm)
+        plate = sign(_vivid(rng))(rng, max(4, int(0.13 * ppm)), max(4, int(0.4 * ppm)), ppm)
         top, left = int(0.5 * height), int(0.3 * width)
         part = image[top : top + plate.shape[0], left : left + plate.shape[1]]
         part[:] = plate[: part.shape[0], : part.shape[1]]
@@ -246,12 +246,12 @@ def door(color: Color, words: str | None = None) -> Painter:
     return Named("door", paint)
 
 
-def lockers(color: Color, width_m: float = 0.3) -> Painter:
+def lockers(color: Color) -> Painter:
     """A row of metal lockers or drawers, each with slots, number and some stickers."""
 
     def paint(rng: np.random.Generator, height: int, width: int, ppm: float) -> ImageU8:
         image = p.plain(color)(rng, height, width, ppm)
-        count = max(1, round(width / (width_m * ppm)))
+        count = max(1, round(width / (0.3 * ppm)))
         for index in range(count):
             left, right = index * width // count, (index + 1) * width // count
             tint = rng.uniform(0.8, 1.15)

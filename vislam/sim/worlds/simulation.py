@@ -21,7 +21,7 @@ from vislam.core.errors import UsageError
 from vislam.core.files import replacing, write_text
 from vislam.core.messages import Array, Frame, ImageF32, ImageU8, ImuSample, MagSample
 from vislam.imu import ImuNoise
-from vislam.sim.faults.disturbance import Disturbance, DisturbanceOptions
+from vislam.sim.faults.disturbance import Disturbance
 from vislam.sim.motion.spline import BodySpline
 from vislam.sim.scene import NAMES, Renderer, Scene, painted
 from vislam.sim.sensing import DepthNoise, Imager, exposure_gains, sense_depth, sense_field, sense_imu
@@ -151,13 +151,7 @@ class Simulation:
 
     @cached_property
     def _disturbance(self) -> Disturbance:
-        o = self.options
-        length_s = np.inf if o.moving_length_s is None else o.moving_length_s
-        chosen = DisturbanceOptions(
-            o.blank_begin_s, o.blank_length_s, o.blank_every_s, o.light_every_s, o.light_stops, o.moving_share,
-            o.moving_begin_s, length_s,
-        )  # fmt: skip
-        return Disturbance(self.rig, chosen, np.random.SeedSequence(self.options.world_seed, spawn_key=(7,)))
+        return Disturbance(self.rig, self.options, np.random.SeedSequence(self.options.world_seed, spawn_key=(7,)))
 
     @cached_property
     def _imager(self) -> Imager:
