@@ -1,6 +1,6 @@
 """A hundred random starts of one camera with an IMU: how soon, how exact, what is refused, and is any of them wrong.
 
-    python benchmarks/initialisation.py [starts per kind]
+    python benchmarks/initialisation.py [starts per kind [KIND ...]]
 
 Wrong is a scale off by more than 5 % and three of its stated sigmas, or a tilt off by more than 2 deg and three sigmas.
 """
@@ -70,8 +70,8 @@ def main() -> None:
         f"{'':13}{'started':>9}{'wrong':>6}{'t/s':>8}{'max':>7}{'scale/%':>9}{'max':>7}{'sigma':>8}{'rms z':>7}", end=""
     )
     print(f"{'tilt max':>9}{'cpu/ms':>8}  last refusals of those not started")
-    counts = dict.fromkeys(KINDS, int(sys.argv[1])) if len(sys.argv) > 1 else SHARES
-    wrong = sum(run_kind(kind, counts[kind]) for kind in KINDS)
+    counts = dict.fromkeys(sys.argv[2:] or KINDS, int(sys.argv[1])) if len(sys.argv) > 1 else SHARES
+    wrong = sum(run_kind(kind, count) for kind, count in counts.items())
     print(f"{wrong} wrong of {sum(counts.values())}")
 
 

@@ -40,7 +40,7 @@ from vislam.sensors import BodyState, Configured, Suite, Variable, linearised  #
 from vislam.sensors.kinds import Height, Twist, TwistSettings  # noqa: E402
 from vislam.sensors.simulated import bodies_on, drawn_readings  # noqa: E402
 
-CALLS, TIMES = 500, 7
+TIMES = 7
 LEVER_M = (0.2, 0.1, -0.3)
 
 
@@ -103,22 +103,24 @@ def pairs() -> list[tuple[str, Configured, str, Configured]]:
     return [("laser", example_laser(), "height", Height()), ("doppler", DopplerLog(), "twist", twist)]
 
 
-def least_us(work: Callable[[], object]) -> float:
-    """Return CPU microseconds of a call, the least of several rounds."""
+def least_us(work: Callable[[], object], calls: int) -> float:
+    """Return CPU microseconds of a call, the least of several rounds of `calls`."""
     work()
     best = math.inf
     for _ in range(TIMES):
         begun_s = time.process_time()
-        for _ in range(CALLS):
+        for _ in range(calls):
             work()
         best = min(best, time.process_time() - begun_s)
-    return 1e6 * best / CALLS
+    return 1e6 * best / calls
 
 
-def linearised_us(sensor: Configured, readings: list[Reading], bodies: list[BodyState], own: Array) -> float:
+def linearised_us(
+    sensor: Configured, readings: list[Reading], bodies: list[BodyState], own: Array, calls: int
+) -> float:
     """Return CPU microseconds of a reading as a linear system."""
     k = len(readings) // 2
-    return least_us(lambda: linearised(sensor, readings[k], bodies[k], own))
+    return least_us(lambda: linearised(sensor, readings[k], bodies[k], own), calls)
 
 
 def run_ms(recording: Recording, suite: Suite | None, readings: list[Reading]) -> tuple[float, float]:
@@ -140,6 +142,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="of the drive")
     parser.add_argument("--rate", type=float, default=50.0, help="readings a second")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each, of which the least counts")
+    parser.add_argument("--calls", type=int, default=500, help="of `linearised`, in each of several rounds")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     recording = open_source(f"points:workshop-cart,rig=stereo,duration_s={args.seconds},camera_hz=10,tracks=100")
@@ -150,7 +153,7 @@ def main() -> None:
     sensors = {name: sensor for pair in pairs() for name, sensor in (pair[:2], pair[2:])}
     owns = {name: np.array([variable.start for variable in sensor.variables]) for name, sensor in sensors.items()}
     readings = {name: drawn_readings(name, sensors[name], bodies, owns[name], seed=1) for name in sensors}
-    one_us = {name: linearised_us(sensors[name], readings[name], bodies, owns[name]) for name in sensors}
+    one_us = {name: linearised_us(sensors[name], readings[name], bodies, owns[name], args.calls) for name in sensors}
     runs: dict[str, list[tuple[float, float]]] = {}
     for _ in range(args.rounds):
         runs.setdefault("none", []).append(run_ms(recording, None, []))

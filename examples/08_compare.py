@@ -19,7 +19,7 @@ SEEDS = range(3)
 
 def error_m(seed: int, config: Config) -> float:
     """Return the ATE of the filter alone, without loops or graph, on one world: its seed is that of all noise."""
-    world = open_points("laps", seed=seed, rig="stereo", duration_s=8.0, tracks=60, camera_hz=10.0)
+    world = open_points("laps", seed=seed, rig="stereo", duration_s=6.0, tracks=60, camera_hz=10.0)
     front = Front(config, world.rig, world.imu_noise, StageClock())
     stamps_ns, poses = [], []
     for step in odometry(front, world.events()):

@@ -21,7 +21,7 @@ name = "own"
 config = {"loop.enabled" = false}
 seeds = [0, 1]
 members = 1
-sequences = [{name = "laps", source = "points:laps", options = {rig = "stereo", duration_s = 6.0, camera_hz = 10.0}}]
+sequences = [{name = "laps", source = "points:laps", options = {rig = "stereo", duration_s = 5.0, camera_hz = 10.0}}]
 estimators = [{name = "vislam", outputs = ["ekf"]}, {name = "mine", program = "PROGRAM", options = {keep = 0.7}}]
 """
 

@@ -3,7 +3,7 @@
     python examples/11_further_sensors.py               # wheels and ranges
     python examples/11_further_sensors.py height twist  # others; `all`: every kind, half a minute of CPU
 
-A cart drives for 16 s and sees nothing from 8 to 12 s. Each kind's table is what a TOML file would have; its readings
+A cart drives for 13 s and sees nothing from 7 to 10 s. Each kind's table is what a TOML file would have; its readings
 are drawn on the truth with the noise that it says, and its own variables by their sigmas, so that they must be found.
 """
 
@@ -18,7 +18,7 @@ from vislam.config import FurtherSensorsConfig
 from vislam.runs import further_readings
 from vislam.trajectory import Trajectory, evaluate
 
-WORLD = "points:cart-drive,rig=stereo,duration_s=16,camera_hz=5,tracks=60,outage_begin_s=8,outage_length_s=4"
+WORLD = "points:cart-drive,rig=stereo,duration_s=13,camera_hz=5,tracks=60,outage_begin_s=7,outage_length_s=3"
 ANCHORS = "anchors = {1 = [-9.0, -9.0, 0.2], 2 = [9.0, -9.0, 3.0], 3 = [9.0, 9.0, 0.5], 4 = [-9.0, 9.0, 2.5]}"
 KINDS = {  # lines of its table, readings a second
     "position": ("sigma_m = 0.05\nsigma_up_m = 0.1", 5),

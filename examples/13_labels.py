@@ -13,7 +13,7 @@ from vislam.core import Array, Frame
 from vislam.mapping import LabelClasses, label_at, nearest, things_of
 from vislam.sim.scene import NAMES
 
-WORLD = "sim:handheld-room,duration_s=8,camera_hz=10,image_width_px=320"
+WORLD = "sim:handheld-room,duration_s=8,camera_hz=5,image_width_px=320"
 WRONG = 0.2  # share of images
 
 

@@ -15,7 +15,7 @@ from vislam import Config, Slam, open_source
 from vislam.core import Array, Frame, MaskedRecording, Recording
 from vislam.trajectory import Trajectory, evaluate
 
-WORLD = "sim:handheld-room,duration_s=6,camera_hz=10,image_width_px=320,moving_share=0.6,moving_begin_s=1.5"
+WORLD = "sim:handheld-room,duration_s=6,camera_hz=10,image_width_px=160,moving_share=0.6,moving_begin_s=1.5"
 PERSON_M = 2.0  # away from the camera, nearer than most of the room
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vislam import Config, Slam, open_source
 
-WORLD = "points:laps,rig=mono,duration_s=13,camera_hz=10,tracks=100,outage_begin_s=9,outage_length_s=3"
+WORLD = "points:laps,rig=mono,duration_s=13,camera_hz=5,tracks=100,outage_begin_s=9,outage_length_s=3"
 
 
 def off_m(further_cameras: int) -> float:

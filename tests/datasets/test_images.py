@@ -49,23 +49,20 @@ def test_cut_image_is_unreadable_not_grey(tmp_path: Path, suffix: str) -> None:
             probe(path)
 
 
-def test_damage_in_the_middle_of_a_png_is_unreadable(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("at", "put", "error", "said"),
+    [
+        (200, bytes(60), UnreadableImageError, "unreadable image"),  # in the middle of what is compressed
+        (16, (100_000).to_bytes(4, "big") * 2, DataError, r"a.png is 100000x100000 but its calibration is for 64x48"),
+    ],
+    ids=["damaged", "forged size"],
+)
+def test_wrong_bytes_in_a_png_are_refused(tmp_path: Path, at: int, put: bytes, error: type, said: str) -> None:
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), picture(1))
-    data = bytearray(path.read_bytes())
-    data[200:260] = bytes(60)
-    path.write_bytes(data)
-    with pytest.raises(UnreadableImageError):
-        read(path)
-
-
-def test_forged_size_is_refused_before_decoding(tmp_path: Path) -> None:
-    path = tmp_path / "a.png"
-    cv2.imwrite(str(path), picture(1))
-    data = bytearray(path.read_bytes())
-    data[16:24] = (100_000).to_bytes(4, "big") * 2
-    path.write_bytes(data)
-    with pytest.raises(DataError, match=r"a.png is 100000x100000 but its calibration is for 64x48"):
+    data = path.read_bytes()
+    path.write_bytes(data[:at] + put + data[at + len(put) :])
+    with pytest.raises(error, match=said):
         read(path)
 
 

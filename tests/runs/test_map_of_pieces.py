@@ -21,7 +21,7 @@ SETTINGS = {"view.enabled": False, "imu.enabled": False, "map.products": ("cloud
 
 def run(out, base=None, localize_only=False, settings=None, **options):
     prepare(out, overwrite=False)
-    recording = open_world("handheld-room", camera_hz=10.0, image_width_px=320, **options)
+    recording = open_world("handheld-room", camera_hz=10.0, image_width_px=240, **options)
     choice = None if base is None else MapChoice(base / "session.db", localize_only)
     return execute(recording, load(None, SETTINGS | (settings or {})), out, "test", [], base=choice)
 

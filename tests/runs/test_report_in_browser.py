@@ -361,12 +361,12 @@ def test_pages_of_runs_and_of_graphs_are_readable_on_a_phone_and_on_paper(chromi
 
 def test_labels_are_shown_by_class_and_each_can_be_turned_off(chromium, tmp_path):
     run = make_run(tmp_path / "labels")
-    x, y = (side.ravel() for side in np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-4, 4, 0.05)))
-    keys = np.unique(voxel_keys(np.stack([x, y, np.full_like(x, 0.01)], axis=1), 0.05))
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-6, 6, 0.1), np.arange(-4, 4, 0.1)))
+    keys = np.unique(voxel_keys(np.stack([x, y, np.full_like(x, 0.01)], axis=1), 0.1))
     labels, ones = (1 + np.arange(len(keys)) * 2 // len(keys)).astype(np.uint16), np.ones(len(keys), np.int32)
     evil = "</script><script>document.title='owned'</script>"
     names = LabelClasses.of({"1": {"name": "door", "color": [255, 0, 0]}, "2": evil}, "test")
-    write_layer(run / "map", LabelLayer(0.05, names, keys, labels, ones, ones))
+    write_layer(run / "map", LabelLayer(0.1, names, keys, labels, ones, ones))
     red = f"""() => {{ const colors = ({COLORS.replace("new Set(new Uint32Array(pixels.buffer)).size", "pixels")})();
         let count = 0;
         for (let k = 0; k < colors.length; k += 4) count += colors[k] > 200 && colors[k + 1] < 60 && colors[k + 2] < 60;

@@ -20,6 +20,7 @@ import pytest
 
 from vislam.cli import run_verb
 from vislam.cli.verbs import VERBS
+from worlds.shared import shared
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
@@ -54,7 +55,7 @@ SMALLEST = {
     "experiments/label_noise.py": "--hz 0.2 --width 64",
     "experiments/loop_precision_recall.py": "--sources points:laps,duration_s=2,tracks=60 --seeds 1 --out out",
     "experiments/rigs.py": "--rigs stereo+1 --seeds 0 --seconds 2",
-    "experiments/masks.py": "--shares 0.3 --seconds 3 --width 160",
+    "experiments/masks.py": "--shares 0.3 --seconds 2.3 --width 64",
     "experiments/moving_person.py": "--seconds 3 --width 64",
     "experiments/odometry_consistency.py": "{recording}",
     "experiments/planar_odometry.py": "--source {cart} --out out",
@@ -69,7 +70,7 @@ SMALLEST = {
     "benchmarks/bag_reader.py": "--frames 5 --size 64 48 --rounds 1",
     "benchmarks/drawn_camera.py": "--width 64 --frames 1 --rounds 1 --moments 2",
     "benchmarks/ekf.py": "cost --rounds 1",
-    "benchmarks/initialisation.py": "1",
+    "benchmarks/initialisation.py": "1 moving",
     "benchmarks/live_latency.py": "processes --seconds 3 --keyframes 20",
     "benchmarks/long_run.py": "chain --kilometres 0.05",
     "benchmarks/loop_index.py": "--sources {recording} --sizes 100 --depths 3",
@@ -80,7 +81,7 @@ SMALLEST = {
     "benchmarks/monodepth.py": "--frames 0 --accuracy-frames 3",
     "benchmarks/pose_graph.py": "growth --shapes manhattan --sizes 100",
     "benchmarks/range_frames.py": "2",
-    "benchmarks/sensor_cost.py": "--seconds 1 --rounds 1",
+    "benchmarks/sensor_cost.py": "--seconds 1 --rounds 1 --calls 5",
     "benchmarks/startup.py": "--help",
     "benchmarks/window.py": "compare --seconds 2 --seeds 1",
 }
@@ -99,21 +100,22 @@ ELSEWHERE = {  # what runs the others, or what they need that is not here
 QUOTED = {"tum:PATH": "recording", "runs/mine": "run", "runs/desk": "run", "sphere2500.g2o": "graph"}  # in snippets
 
 
-@pytest.fixture(scope="session")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("inputs")
-    made = {name: folder / name for name in ("recording", "run", "cart")}
-    made["graph"], made["plan"] = folder / "graph.g2o", folder / "plan.toml"
-    made["plan"].write_text(PLAN)
-    size = "--duration-s 3 --camera-hz 10 --exposure-s 0"
+def make_inputs(folder: Path) -> None:
+    (folder / "plan.toml").write_text(PLAN)
+    size = "--duration-s 3 --camera-hz 10 --exposure-s 0 --image-width-px 160"
     for command in (
-        f"simulate handheld-room --rig rgbd {size} --image-width-px 160 --out {made['recording']}",
-        f"run {made['recording']} --out {made['run']} --view.no-enabled --map.products cloud octomap mesh grid drive",
-        f"simulate cart-drive {size} --image-width-px 320 --out {made['cart']}",
-        f"simulate --graph manhattan --poses 60 --out {made['graph']}",
+        f"simulate handheld-room --rig rgbd {size} --out {folder}/recording",
+        f"run {folder}/recording --out {folder}/run --view.no-enabled --map.products cloud octomap mesh grid drive",
+        f"simulate cart-drive {size} --out {folder}/cart",
+        f"simulate --graph manhattan --poses 60 --out {folder}/graph.g2o",
     ):
         assert run_verb(shlex.split(command)) == 0, command
-    return made
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = shared(tmp_path_factory, "written-down", make_inputs)
+    return {path.stem: path for path in folder.iterdir()}
 
 
 def test_every_script_has_its_smallest_input() -> None:

@@ -154,7 +154,7 @@ def test_what_is_drawn_over_a_time_forgets_as_it_is_said() -> None:
 def test_a_frame_that_begins_is_as_sure_as_readings_that_err_together_make_it(tau_s: float) -> None:
     plain = Position(PositionSettings(0.3, 0.3))
     sensor, bodies, off, plainly = Correlated(plain, [1.0], tau_s), a_way(100.0), [], []
-    for seed in range(30):
+    for seed in range(15):
         rng = np.random.default_rng(seed)
         own = np.concatenate([rng.uniform(-3, 3, 1), 10.0 * rng.normal(size=3), rng.normal(size=3)])
         readings = drawn_readings("it", sensor, bodies, own, seed)
@@ -171,7 +171,7 @@ def test_a_frame_that_begins_is_as_sure_as_readings_that_err_together_make_it(ta
 def test_the_graph_is_honest_about_fixes_that_err_together_and_was_not() -> None:
     nees: dict[str, list[float]] = {"shared": [], "each for itself": []}
     for name, into in nees.items():
-        for seed in range(3):
+        for seed in range(2):
             into.extend(nees_of_graph(seed, name == "shared"))
     print({name: round(float(np.mean(values)), 2) for name, values in nees.items()})
     assert 0.3 < np.mean(nees["shared"]) < 1.7

@@ -118,7 +118,7 @@ class Inertial:
         yaw = float(np.arctan2(T_odom_body[1, 0], T_odom_body[0, 0]))
         R = so3_exp(np.array([0.0, 0.0, yaw])) @ level_rotation(felt.accel_m_s2.mean(axis=0))
         known_m2 = np.zeros((3, 3)) if self._at_frame is None else self._at_frame.covariance[3:6, 3:6]
-        self.filtering.tear(lost_motion(t_ns, keyframe_id, True), transform(R, T_odom_body[:3, 3]), known_m2)
+        self.filtering.tear(lost_motion(t_ns, keyframe_id, True), transform(R, T_odom_body[:3, 3].copy()), known_m2)
 
     def _felt_astray(self, t_ns: int) -> ImuSpan | None:
         """Return the newest samples before a frame, if the filter knows too little there; those to come may do."""

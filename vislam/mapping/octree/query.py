@@ -53,13 +53,13 @@ def ray_cast(
     """
     ways = _rows(directions, 3, "directions")
     origins = _rows(origins_m, 3, "ray origins").astype(np.float32).astype(np.float64)
-    starts = np.broadcast_to(origins, ways.shape)
+    starts = np.array(np.broadcast_to(origins, ways.shape), order="C")  # a view may be read-only: another kernel
     lengths = np.linalg.norm(ways, axis=1)
     if not (lengths > 0.0).all():
         raise DataError(f"the direction of ray {int(np.flatnonzero(~(lengths > 0.0))[0])} has length zero")
     _check_positive(max_range_m, "a ray's range")
     outcome, range_m, voxel = kernels.cast(
-        np.ascontiguousarray(starts), ways / lengths[:, None], max_range_m, unknown == "stop", grid.resolution_m,
+        starts, ways / lengths[:, None], max_range_m, unknown == "stop", grid.resolution_m,
         *grid.pool.arrays,
     )  # fmt: skip
     return RayHits(outcome, range_m, voxel)
@@ -91,7 +91,7 @@ def box_state(grid: Octree, centres_m: Numbers, size_m: Numbers, R_map_box: Numb
     turn = np.eye(3) if R_map_box is None else np.asarray(R_map_box, dtype=np.float64)
     if turn.shape not in ((3, 3), (len(centres), 3, 3)):
         raise DataError(f"boxes are turned by one or {len(centres)} rotations, got shape {turn.shape}")
-    R = np.ascontiguousarray(np.broadcast_to(turn, (len(centres), 3, 3)))
+    R = np.array(np.broadcast_to(turn, (len(centres), 3, 3)), order="C")
     if not are_rotations(R, 1e-6).all():
         raise DataError("a box is turned by a matrix that is no rotation")
     _check_size(grid, np.full(3, float(np.linalg.norm(size))))

@@ -220,7 +220,7 @@ def _write_colmap(folder: Path, shown: PosedImages, cameras: str, writer: _Image
     lines = []
     for i, T in enumerate(shown.T_map_cam):
         T_cam_map = invert(T)
-        pose = [*quaternion_wxyz(T_cam_map[:3, :3]), *T_cam_map[:3, 3]]
+        pose = [*quaternion_wxyz(T_cam_map[:3, :3].copy()), *T_cam_map[:3, 3]]
         lines.append(f"{i + 1} {' '.join(_text(pose))} {shown.camera[i] + 1} {image_name(shown, i)}\n")
         rows = slice(bounds[i], bounds[i + 1])
         seen = zip(shown.pixels_px[rows] + _HALF_PX, shown.point[rows] + 1, strict=True)
