@@ -92,7 +92,7 @@ class Chain:
             k, duration_s = record.id, _duration_s(before, record)
             has_imu = self.has_imu and self._inertial(factors, record, before, values, duration_s)
             if record.begins_submap:
-                factors.append(self._weak_link(record))
+                factors.append(self._weak_link(record, robust=True))
             elif seen[k] < min_seen:
                 tied.append(k)
                 factors += self._odometry_factors(record, values, duration_s, has_imu)
@@ -109,7 +109,7 @@ class Chain:
             duration_s = _duration_s(self.records[record.id - 1], record)
             T = self._odometry[record.id - 1]
             if record.begins_submap:
-                edges.append(self._weak_link(record))
+                edges.append(self._weak_link(record, robust=False))
                 continue
             if record.T_previous_body is None or record.covariance is None:
                 edges.append(motion.loose_motion(record.id, T, *self._loose(duration_s)))
@@ -165,12 +165,16 @@ class Chain:
             floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG), scale_sigma=scale_sigma,
         )  # fmt: skip
 
-    def _weak_link(self, record: KeyframeRecord) -> gtsam.BetweenFactorPose3:
-        """Return what keeps a submap near where habit or else the run had it, should no loop tie it."""
+    def _weak_link(self, record: KeyframeRecord, robust: bool) -> gtsam.BetweenFactorPose3:
+        """Return what keeps a submap near where habit or else the run had it, should no loop tie it.
+
+        `robust`: where habit has it, under Huber's kernel.
+        """
         config, k = self._config, record.id
         if record.is_tied and record.T_previous_body is not None and record.covariance is not None:
-            model = gaussian(record.covariance, config.covariance_ratio_max)
-            return pose_factor(X(k - 1), X(k), record.T_previous_body, huber(model, config.huber_k))
+            model: gtsam.noiseModel.Base = gaussian(record.covariance, config.covariance_ratio_max)
+            model = huber(model, config.huber_k) if robust else model
+            return pose_factor(X(k - 1), X(k), record.T_previous_body, model)
         T = nearest_rigid(invert(self.poses[k - 1]) @ self.poses[k])
         return motion.loose_motion(k, T, np.deg2rad(SUBMAP_SIGMA_DEG), config.submap_sigma_m)
 
