@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.batch.posegraph.problem import RelativePoses
 from vislam.config import GraphConfig, MachineConfig
 from vislam.core.errors import DataError
 from vislam.core.geometry import are_rotations, invert
@@ -19,17 +20,12 @@ from vislam.factors.factor_log import FactorLog
 from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
 from vislam.factors.motion import SUBMAP_SIGMA_DEG, start_factors
-from vislam.factors.noise_models import (
-    DIRECTION_FLOOR_DEG,
-    DIRECTION_SCALE_SIGMA,
-    DIRECTION_SOFT_M,
-    gaussian,
-    huber,
-)
+from vislam.factors.noise_models import DIRECTION_SCALE_SIGMA, gaussian, huber
 from vislam.factors.preintegration import Preintegrator
-from vislam.factors.visual import direction_as_pose, pose_factor
+from vislam.factors.visual import direction_as_pose, measurement_of, pose_factor
 
 Factors = list[gtsam.NonlinearFactor]
+_UNSCALED_SIGMA = 0.1  # relative, on the steps of the run's own odometry with one camera, among its loops
 
 
 class Chain:
@@ -102,22 +98,21 @@ class Chain:
                     factors.append(motion.zero_velocity(k, self._machine.rest_speed_sigma_m_s))
         return factors, tied
 
-    def odometry_edges(self, scale_sigma: float) -> list[gtsam.BetweenFactorPose3]:
-        """Return the run's odometry as metric edges; `scale_sigma` is the relative one where vision had no scale."""
-        edges = []
-        for record in self.records[1:]:
-            duration_s = _duration_s(self.records[record.id - 1], record)
-            T = self._odometry[record.id - 1]
-            if record.begins_submap:
-                edges.append(self._weak_link(record, robust=False))
-                continue
-            if record.T_previous_body is None or record.covariance is None:
-                edges.append(motion.loose_motion(record.id, T, *self._loose(duration_s)))
-                continue
-            T, covariance = self._metric(record, T, scale_sigma)
-            model = gaussian(covariance, self._config.covariance_ratio_max)
-            edges.append(pose_factor(X(record.id - 1), X(record.id), T, model))
-        return edges
+    def odometry(self) -> RelativePoses:
+        """Return the run's own odometry from keyframe to keyframe, metric also where vision had no scale."""
+        factors = [self._odometry_edge(before, record) for before, record in pairwise(self.records)]
+        return RelativePoses.of([(r.id - 1, r.id) for r in self.records[1:]], [measurement_of(f) for f in factors])
+
+    def _odometry_edge(self, before: KeyframeRecord, record: KeyframeRecord) -> gtsam.BetweenFactorPose3:
+        """Return what the run's own odometry says of the motion to a keyframe."""
+        if record.begins_submap:
+            return self._weak_link(record, robust=False)
+        T = self._odometry[record.id - 1]
+        if record.T_previous_body is None or record.covariance is None:
+            return motion.loose_motion(record.id, T, *self._loose(_duration_s(before, record)))
+        T, covariance = self._metric(record, T, _UNSCALED_SIGMA)
+        model = gaussian(covariance, self._config.covariance_ratio_max)
+        return pose_factor(X(record.id - 1), X(record.id), T, model)
 
     def _inertial(
         self, factors: Factors, record: KeyframeRecord, before: KeyframeRecord, values: gtsam.Values, duration_s: float
@@ -154,16 +149,10 @@ class Chain:
         """Return measured odometry as a metric motion with covariance; without scale `T_expected` lends its length."""
         assert record.T_previous_body is not None
         assert record.covariance is not None
-        config, T = self._config, record.T_previous_body
-        covariance = of_vision(record, config)
+        T, covariance = record.T_previous_body, of_vision(record, self._config)
         if record.has_scale:
             return T, covariance
-        lever = self._lever_m
-        step_m = float(np.linalg.norm(T_expected[:3, 3] + T_expected[:3, :3] @ lever - lever))
-        return direction_as_pose(
-            T, covariance, lever, max(step_m, DIRECTION_SOFT_M),
-            floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG), scale_sigma=scale_sigma,
-        )  # fmt: skip
+        return direction_as_pose(T, covariance, self._lever_m, T_expected, scale_sigma)
 
     def _weak_link(self, record: KeyframeRecord, robust: bool) -> gtsam.BetweenFactorPose3:
         """Return what keeps a submap near where habit or else the run had it, should no loop tie it.
