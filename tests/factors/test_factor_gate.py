@@ -7,7 +7,7 @@ from vislam.core.messages import LoopEdge
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.belief.gate import PendingLoops
-from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
+from vislam.graph.belief.witnesses import Witnesses, confirming
 from vislam.graph.travel import Travel
 from worlds.lap import T_BODY_CAM0, World
 
@@ -68,11 +68,9 @@ def test_loops_confirm_one_another_only_where_odometry_can_tell(world: World) ->
     travel = _travel(world)
     true = [_model(world.loop(n, 5 + 8 * n, 105 + 8 * n)) for n in range(4)]
     false = [_model(world.false_loop(10 + n, 5 + 8 * n, 107 + 8 * n)) for n in range(4)]
-    chain = travel.chain()
-    assert confirming([*false, *true], chain, 11.0, log_volume(chain)) == [4, 5, 6, 7]
+    assert confirming([*false, *true], travel.chain()) == [4, 5, 6, 7]
     travel.scale(100.0)
-    chain = travel.chain()
-    assert confirming([*false, *true], chain, 11.0, log_volume(chain)) == []
+    assert confirming([*false, *true], travel.chain()) == []
 
 
 def test_covariance_between_any_two_keyframes_is_that_of_the_steps_composed(world: World) -> None:

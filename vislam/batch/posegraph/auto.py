@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vislam.batch.posegraph.gnc import reject_false_edges, trusted_edges
-from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
+from vislam.batch.posegraph.judge import Judge, Judgement
 from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
 from vislam.batch.posegraph.solver import Kernel, Progress, kernel_route, levenberg_marquardt
 from vislam.batch.posegraph.starts import chordal_start, odometry_start
@@ -28,6 +28,7 @@ from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
+from vislam.factors.evidence import APART, PLACE, SOUND, extent
 
 Mask = NDArray[np.bool_]
 
@@ -42,10 +43,8 @@ _NEARLY_ALL = 0.97  # of the loops kept, from which on nothing else is tried
 _OVERSTATED = 0.1  # of the stated variances: where loops show less, all are rescaled before judging
 _NUMBERS_MIN = 30  # redundant ones, to show it
 _SAME_PLACE = 0.02  # of the extent: solutions that differ by less, rms, are one
-_APART = 8.0  # log-likelihood between solutions that contradict each other, below which nothing is decided
 _GAIN_MIN = 6.0  # of the objective: what a solution must explain beyond odometry alone, if all others contradict it
 _ALONE = 0.5  # leverage from which on nothing else confirms a loop
-_THIN = 4.0  # log-odds of a cluster that stands alone, below which it is not believed
 _NAMED = 5  # clusters in a message
 
 
@@ -224,7 +223,7 @@ def _lowest(problem: PoseGraphProblem, poses: Array, kept: Mask) -> Array:
 def _same(problem: PoseGraphProblem, one: Array, other: Array) -> bool:
     d = problem.dimension
     apart = float(np.sqrt(np.mean(np.sum((one - other)[:, :d, d] ** 2, axis=1))))
-    return apart <= _SAME_PLACE * extent(problem, one)
+    return apart <= _SAME_PLACE * extent(one[:, :d, d])
 
 
 def _disputed(best: Judgement, rivals: list[Judgement]) -> Mask:
@@ -232,7 +231,7 @@ def _disputed(best: Judgement, rivals: list[Judgement]) -> Mask:
     out = np.zeros(len(best.kept), dtype=np.bool_)
     for rival in rivals:
         ours, theirs = best.kept & ~rival.kept, rival.kept & ~best.kept
-        if theirs.any() and 0.5 * (rival.objective - best.objective) < _APART:
+        if theirs.any() and 0.5 * (rival.objective - best.objective) < APART:
             out |= ours | theirs
     return out
 
@@ -244,7 +243,7 @@ def _thin(problem: PoseGraphProblem, best: Judgement, trusted: Mask) -> Mask:
     out = np.zeros(len(trusted), dtype=np.bool_)
     count = np.bincount(cluster)
     alone = np.bincount(cluster, best.leverage[at]) >= _ALONE * count
-    weak = np.bincount(cluster, best.evidence[at]) < _THIN
+    weak = np.bincount(cluster, best.evidence[at]) < SOUND
     out[at] = (alone & weak)[cluster]
     return out
 
@@ -252,7 +251,7 @@ def _thin(problem: PoseGraphProblem, best: Judgement, trusted: Mask) -> Mask:
 def _clusters(problem: PoseGraphProblem, at: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the cluster of each of the edges `at`: chains of loops whose ends are near each other in time."""
     ends = np.sort(problem.edges[at], axis=1)
-    pairs = cKDTree(ends).query_pairs(PLACE / 2, p=np.inf, output_type="ndarray") if len(at) else ends
+    pairs = cKDTree(ends).query_pairs(PLACE, p=np.inf, output_type="ndarray") if len(at) else ends
     joined = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(at), len(at)))
     return connected_components(joined, directed=False)[1].astype(np.int64)
 

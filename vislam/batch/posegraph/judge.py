@@ -25,10 +25,10 @@ from vislam.batch.posegraph.solver import levenberg_marquardt
 from vislam.batch.posegraph.structure import Structure
 from vislam.core.chi_square import chi_square_limits
 from vislam.core.messages import Array
+from vislam.factors.evidence import PLACE, SOUND, entering, extent, spread
 
 Mask = NDArray[np.bool_]
 
-_LEVELS = (16.0, 12.0, 8.0, 4.0, 2.0, 0.0)  # log-odds of a loop that enters; lower ones once there is nothing above
 _ROUNDS_MAX = 40
 _KNOWN = 10.0  # information times the square of the space's spread: below, a direction is not known
 _TAILS = 4.0  # times the chi-square limit: errors of real loops have heavier tails than a Gaussian
@@ -37,7 +37,6 @@ _ODDS = math.log(3.0)  # a loop is believed that is three times likelier true th
 _SUPPOSED_MAX = 6  # loops, one at a time, that are supposed true, the likeliest first, ...
 _HARDLY = -3.0  # ... down to these log-odds
 _CLEARLY = 16.0  # of the objective: what shows that one is true
-_SOUND = 4.0  # log-odds of a kept loop below which it may have to go before others can come
 _BACK = 2.0  # log-odds more for every time that it was taken back
 _BORDER = 1.0  # log-odds: covariances of loops nearer to a decision are computed in every round
 _CHANGED = 0.05  # of the loops kept: as many changes, and those of all are
@@ -52,8 +51,6 @@ _JUDGED_MIN = 5  # loops, to show theirs
 _LEVERAGE_MAX = 1.0 - 1e-9
 _ITERATIONS, _TOLERANCE = 10, 1e-5
 _PLACE_WAY = 0.05  # of the extent: as far along the way a place reaches
-
-PLACE = 20  # successive poses that make one place, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,13 +84,9 @@ class Judge:
         """Take the extent of `poses` [N, d + 1, d + 1] as the space in which a false loop may put a pose."""
         self._problem, self._trusted = problem, trusted
         self._loops = np.flatnonzero(~trusted)
-        self._space_m = extent(problem, poses)
+        self._space_m, self._spread = extent(poses[:, :-1, -1]), spread(poses[:, :-1, -1])
         self._at = _along(problem, poses, _PLACE_WAY * self._space_m)
-        d, k = problem.dimension, problem.tangent
-        spread = np.full(k, self._space_m / math.sqrt(2.0 * math.pi))  # a Gaussian with a box's density at its peak
-        spread[: k - d] = (2.0 * math.pi if d == 2 else (8.0 * math.pi**2) ** (1.0 / 3.0)) / math.sqrt(2.0 * math.pi)
-        self._spread = spread
-        values, self._axes = np.linalg.eigh(problem.information * np.outer(spread, spread))
+        values, self._axes = np.linalg.eigh(problem.information * np.outer(self._spread, self._spread))
         self._known = values > _KNOWN
         self._values = np.where(self._known, values, 1.0)
         self._dof = self._known.sum(axis=1)
@@ -109,8 +102,8 @@ class Judge:
         first, best = found, None
         while best is not found:
             best, core = found, found
-            if best.evidence[best.kept].min() < _SOUND:
-                core = self.settle(best.poses, best.kept & (best.evidence >= _SOUND), 0)
+            if best.evidence[best.kept].min() < SOUND:  # it may have to go before others can come
+                core = self.settle(best.poses, best.kept & (best.evidence >= SOUND), 0)
             evidence = np.where(best.kept, -np.inf, core.evidence)
             for e in np.argsort(-evidence, kind="stable")[:_SUPPOSED_MAX].tolist():
                 if evidence[e] < _HARDLY or best.objective - found.objective > _CLEARLY:
@@ -142,7 +135,7 @@ class Judge:
             leaves = _leaving(inside, score)
             enters = np.zeros(len(at), dtype=np.bool_)
             if leaves.sum() <= max(1, 0.01 * inside.sum()):
-                enters, level = _entering(inside, score - _BACK * times_out, level)
+                enters, level = entering(np.where(inside, -np.inf, score - _BACK * times_out), level)
             if left == 0 or not np.any(leaves | enters):
                 if left == 0 or was_fresh or changed == 0:
                     break
@@ -260,7 +253,7 @@ class Judge:
         distance, spread = _studentised(z, L, taken)
         stated = np.log(self._values[at]).sum(axis=1) - self._dof[at] * np.log(variances[at])
         # the space as it is now: that of odometry may be many times too large
-        smaller = math.log(extent(self._problem, poses) / self._space_m)
+        smaller = math.log(extent(poses[:, :-1, -1]) / self._space_m)
         share = self._share(kept)
         evidence = 0.5 * (stated - spread - distance) + math.log(share / (1.0 - share))
         evidence += np.minimum(self._dof[at], self._problem.dimension) * min(smaller, 0.0)
@@ -284,18 +277,11 @@ class Judge:
         return np.einsum("eab,ea->eb", self._axes[at], r) * root
 
 
-def extent(problem: PoseGraphProblem, poses: Array) -> float:
-    """Return the geometric mean of the sides of the box around poses, none shorter than a tenth of the longest."""
-    d = problem.dimension
-    sides = np.ptp(poses[:, :d, d], axis=0)
-    return float(np.exp(np.mean(np.log(np.maximum(sides, max(0.1 * sides.max(initial=0.0), 1e-9))))))
-
-
 def _along(problem: PoseGraphProblem, poses: Array, place_m: float) -> Array:
     """Return where poses are in the sequence and along the way [N, 2], in places."""
     d = problem.dimension
     steps = np.linalg.norm(np.diff(poses[:, :d, d], axis=0, prepend=poses[:1, :d, d]), axis=1)
-    return np.column_stack([np.arange(len(poses)) / (PLACE / 2), np.cumsum(steps) / place_m])
+    return np.column_stack([np.arange(len(poses)) / PLACE, np.cumsum(steps) / place_m])
 
 
 def _studentised(z: Array, L: Array, taken: Array) -> tuple[Array, Array]:
@@ -316,14 +302,6 @@ def _leaving(inside: Mask, score: Array) -> Mask:
     """Return the worst of the loops that are in and should not be."""
     bad = inside & (score < 0.0)
     return bad & (score <= _WORST * score[bad].min(initial=0.0))
-
-
-def _entering(inside: Mask, score: Array, level: int) -> tuple[Mask, int]:
-    """Return the loops of the highest level that has any to let in, and that level."""
-    score = np.where(inside, -np.inf, score)
-    while level + 1 < len(_LEVELS) and not np.any(score > _LEVELS[level]):
-        level += 1
-    return score > _LEVELS[level], level
 
 
 def _apart(scales: tuple[float, float], others: tuple[float, float]) -> float:
