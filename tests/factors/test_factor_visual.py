@@ -110,8 +110,7 @@ def test_direction_as_pose_lets_scale_go_and_holds_direction(seed: int) -> None:
     measured, t = _measure(T_a, T_b)
     sigma = 0.01
     covariance = np.diag([1e-6] * 3 + [sigma**2] * 3)
-    floor = np.deg2rad(DIRECTION_FLOOR_DEG)
-    covariance[3:, 3:] -= floor**2 * np.eye(3)  # which it adds
+    covariance[3:, 3:] -= np.deg2rad(DIRECTION_FLOOR_DEG) ** 2 * np.eye(3)  # which it adds
     mean, out = direction_as_pose(measured, covariance, LEVER_M, invert(T_a) @ T_b)
     np.testing.assert_allclose(mean, invert(T_a) @ T_b, atol=1e-12)
     R = measured[:3, :3]
