@@ -82,10 +82,11 @@ def _decide(
     judge = Judge(problem, trusted, odometry, config.inlier_probability)
     assert gnc.poses is not None
     plain = _plain(structure.problem, trusted, gnc.poses, config.inlier_probability)
-    alone, _ = judge.objective(odometry, trusted)
+    alone = judge.objective(odometry, trusted)
     found = _solutions(problem, judge, trusted, _routes(problem, trusted, odometry, plain, gnc), alone)
     loops = np.flatnonzero(~trusted)
-    (best_name, best), rivals = found[0], [e for e in found[1:] if e[1].is_likelier(alone)]
+    (best_name, best), others = found[0], [(name, j) for name, j in found[1:] if np.any(j.kept & ~trusted)]
+    rivals = [(name, j) for name, j in others if j.is_likelier(alone)]
     gain = alone - best.objective
     held, lost = best.kept & ~trusted, ~best.kept
     if not held.any() or not _is_enough(problem, judge, gain, held, lost):
@@ -101,7 +102,7 @@ def _decide(
     undecided = np.flatnonzero(disputed | thin)
     kept[undecided] = False
     if np.any(disputed | thin | tails):
-        _, poses = judge.objective(poses, kept)
+        poses = judge.optimum(poses, kept)
     reason = (
         f"{best_name}: {(kept & ~trusted).sum()} of {len(loops)} loops agree with odometry and each other"
         f" (log-likelihood {0.5 * gain:.4g} above odometry alone"
@@ -175,8 +176,7 @@ def _solutions(
     supposed true, unless what is likelier leaves none in doubt.
     """
     settled: list[tuple[str, Judgement]] = []
-    for name, end, kept in routes:
-        poses = _lowest(problem, end, kept)
+    for name, poses, kept in routes:
         believed = [j for _, j in settled if j.is_likelier(alone)]
         if any(_same(problem, poses, j.poses) for j in believed):
             break
@@ -187,9 +187,12 @@ def _solutions(
         nearly_all = found.strain <= 1.0 and found.kept[~trusted].mean() >= _NEARLY_ALL
         if nearly_all or any(_same(problem, found.poses, j.poses) for j in believed):
             break
-    return sorted(
-        settled, key=lambda e: (not e[1].is_likelier(alone), not np.any(e[1].kept & ~trusted), e[1].objective)
-    )
+
+    def rank(of: tuple[str, Judgement]) -> tuple[bool, bool, float]:
+        is_alone = not np.any(of[1].kept & ~trusted)  # what keeps no loop is likelier than odometry by rounding alone
+        return is_alone or not of[1].is_likelier(alone), is_alone, of[1].objective
+
+    return sorted(settled, key=rank)
 
 
 def _routes(
@@ -201,9 +204,10 @@ def _routes(
     scale = float(np.quantile(problem.edge_chi2(odometry)[~trusted], _QUANTILE))
     led_to = kernel_route(problem, trusted, odometry, "dcs", scale, True)
     if led_to is not None:
-        yield "dcs", led_to[0], trusted | (led_to[1] >= _IN)
+        kept = trusted | (led_to[1] >= _IN)
+        yield "dcs", _lowest(problem, led_to[0], kept), kept
     assert gnc.poses is not None
-    yield gnc.reason, gnc.poses, gnc.weights > 0.0
+    yield gnc.reason, _lowest(problem, gnc.poses, gnc.weights > 0.0), gnc.weights > 0.0
     yield "odometry", odometry, trusted
 
 

@@ -92,6 +92,7 @@ class Judge:
         self._dof = self._known.sum(axis=1)
         self._limit = _TAILS * chi_square_limits(probability, np.maximum(self._dof, 1))
         self._medians = chi_square_limits(0.5, np.maximum(self._dof, 1))
+        self._newest: tuple[Mask, Structure, Array] | None = None  # of the edges kept that were asked for last
 
     def supposing(self, found: Judgement) -> Judgement:
         """Return what a settled solution grows to where loops are supposed true that nothing decides about.
@@ -121,16 +122,17 @@ class Judge:
         After no rounds that is the edges kept, judged.
         """
         scales, level, changed, at = (1.0, 1.0), 0, 0, self._loops
-        S, judged_with = np.zeros((len(at), len(self._spread), len(self._spread))), scales
+        values, judged_with = np.zeros((len(at), len(self._spread))), scales
+        axes = np.zeros((*values.shape, len(self._spread)))
         stale, score, share = np.ones(len(at), dtype=np.bool_), np.zeros(len(at)), np.zeros(len(at))
         times_out = np.zeros(len(at))
         for left in range(rounds, -1, -1):
-            structure, poses, scales = self._calibrated(poses, kept, scales)
+            poses, scales = self._calibrated(poses, kept, scales)
             if _apart(scales, judged_with) > _SETTLED or changed > _CHANGED * kept[at].sum():
                 stale[:], changed, judged_with = True, 0, scales
-            weights = (self._counts_for(kept) / self._variances(scales))[kept]
-            S[stale], _ = covariances_of_edges(structure, self._problem, poses, weights, at[stale], kept[at[stale]])
-            score, share = self._scores(poses, kept, scales, S)
+            S = self._covariances(poses, kept, scales, at[stale])
+            values[stale], axes[stale] = np.linalg.eigh(self._in_sigmas(S, np.ones(len(kept)), at[stale]))
+            score, share = self._scores(poses, kept, scales, values, axes)
             inside, was_fresh = kept[at], stale.all()
             leaves = _leaving(inside, score)
             enters = np.zeros(len(at), dtype=np.bool_)
@@ -146,17 +148,21 @@ class Judge:
             kept[at[leaves]], kept[at[enters]] = False, True
             changed += int(np.sum(leaves | enters))
             stale = leaves | enters | (np.abs(score) < _BORDER)
-        _, poses, scales = self._calibrated(poses, kept, scales)
+        poses, scales = self._calibrated(poses, kept, scales)
         evidence, leverage = np.full(len(kept), np.inf), np.zeros(len(kept))
         evidence[at], leverage[at] = score + _ODDS, np.where(kept[at], share, 0.0)
         trusted = np.flatnonzero(self._trusted)
         strain = float(np.sum(self._errors(poses, self._variances(scales), trusted) ** 2) / self._dof[trusted].sum())
         return Judgement(poses, kept, *scales, self._likelihood(poses, kept, scales), evidence, leverage, strain)
 
-    def objective(self, poses: Array, kept: Mask) -> tuple[float, Array]:
-        """Return the objective (see `Judgement`) of edges kept [E] and their optimum near poses."""
-        _, poses, scales = self._calibrated(poses, kept, (1.0, 1.0))
-        return self._likelihood(poses, kept, scales), poses
+    def objective(self, poses: Array, kept: Mask) -> float:
+        """Return the objective (see `Judgement`) of edges kept [E] at their optimum near poses."""
+        poses, scales = self._calibrated(poses, kept, (1.0, 1.0))
+        return self._likelihood(poses, kept, scales)
+
+    def optimum(self, poses: Array, kept: Mask) -> Array:
+        """Return the optimum of edges kept [E] near poses."""
+        return self._calibrated(poses, kept, (1.0, 1.0))[0]
 
     def witnesses(self, edges: Mask) -> int:
         """Return how many loops among edges [E] are witnesses independent of each other: one per pair of places."""
@@ -167,10 +173,29 @@ class Judge:
 
     def _counts_for(self, kept: Mask) -> Array:
         """Return what share of itself each edge [E] counts for: kept loops between the same two places make one."""
-        out = np.ones(len(kept))
-        at = self._loops[kept[self._loops]]
-        out[at] = 1.0 / self._alike(at)
-        return out
+        return self._of(kept)[1]
+
+    def _of(self, kept: Mask) -> tuple[Structure, Array]:
+        """Return the structure of the edges kept [E], and for what share of itself each edge counts."""
+        if self._newest is None or self._newest[0] is not kept:
+            at, counts_for = self._loops[kept[self._loops]], np.ones(len(kept))
+            counts_for[at] = 1.0 / self._alike(at)
+            self._newest = kept, Structure(self._problem.with_edges(kept)), counts_for
+        return self._newest[1:]
+
+    def _weights(self, kept: Mask, scales: tuple[float, float]) -> Array:
+        """Return the weights of the edges kept."""
+        return (self._counts_for(kept) / self._variances(scales))[kept]
+
+    def _optimum(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> Array:
+        """Return the poses near these that the edges kept lead to."""
+        structure, weights = self._of(kept)[0], self._weights(kept, scales)
+        return levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
+
+    def _covariances(self, poses: Array, kept: Mask, scales: tuple[float, float], at: NDArray[np.int64]) -> Array:
+        """Return the covariances [M, k, k] of edges `at` at the optimum of those kept, see `covariances_of_edges`."""
+        structure, weights = self._of(kept)[0], self._weights(kept, scales)
+        return covariances_of_edges(structure, self._problem, poses, weights, at, kept[at])[0]
 
     def _alike(self, loops: NDArray[np.int64]) -> Array:
         """Return how many of the loops [M] (indices of edges) join the same two places as each, itself among them."""
@@ -179,24 +204,20 @@ class Judge:
         ends = self._ends(loops)
         return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
 
-    def _calibrated(
-        self, poses: Array, kept: Mask, scales: tuple[float, float]
-    ) -> tuple[Structure, Array, tuple[float, float]]:
-        """Return the optimum of the edges kept, with variances scaled by what their residuals show."""
+    def _calibrated(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> tuple[Array, tuple[float, float]]:
+        """Return the optimum of the edges kept, with variances scaled by what residuals of a sample of them show."""
         edges = np.flatnonzero(kept)
-        structure, trusted = Structure(self._problem.with_edges(edges)), self._trusted[edges]
+        trusted, counts_for = self._trusted[edges], self._counts_for(kept)
         sample = np.concatenate([spread_out(edges[trusted], _SAMPLE), spread_out(edges[~trusted], _SAMPLE)])
-        counts_for = self._counts_for(kept)
         for _ in range(_CALIBRATIONS):
+            poses = self._optimum(poses, kept, scales)
+            S = self._covariances(poses, kept, scales, sample)
             variances = self._variances(scales)
-            weights = (counts_for / variances)[edges]
-            poses = levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
-            S, _ = covariances_of_edges(structure, self._problem, poses, weights, sample, kept[sample])
-            z, L = self._whitened(poses, S, variances, sample)
+            z, L = self._errors(poses, variances, sample), self._in_sigmas(S, variances, sample)
             before, scales = scales, self._scales(z, L, counts_for[sample], sample, scales)
             if _apart(scales, before) < _SETTLED:
                 break
-        return structure, poses, scales
+        return poses, scales
 
     def _likelihood(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> float:
         """Return the objective (see `Judgement`), near poses, of odometry and one kept loop of each two places."""
@@ -238,40 +259,46 @@ class Judge:
             odometry *= float(np.sum(z[trusted] ** 2)) / float(free[trusted].sum())
         judged = ~trusted & (free >= 0.5 * dof)
         if judged.sum() > _JUDGED_MIN:
-            studentised = _studentised(z[judged], L[judged], counts_for[judged])[0]
+            studentised = _studentised(z[judged], *np.linalg.eigh(L[judged]), counts_for[judged])[0]
             loops *= float(np.median(studentised / self._medians[edges][judged]))
         return (
             min(max(odometry, _SCALE_MIN), _ODOMETRY_SCALE_MAX),
             min(max(loops, _LOOPS_BETTER * min(odometry, 1.0), _SCALE_MIN), _LOOP_SCALE_MAX),
         )
 
-    def _scores(self, poses: Array, kept: Mask, scales: tuple[float, float], S: Array) -> tuple[Array, Array]:
-        """Return log-odds of all loops above those asked for, and leverages, given covariances S [L, k, k]."""
-        at, variances = self._loops, self._variances(scales)
-        z, L = self._whitened(poses, S, variances, at)
+    def _scores(
+        self, poses: Array, kept: Mask, scales: tuple[float, float], values: Array, axes: Array
+    ) -> tuple[Array, Array]:
+        """Return log-odds of all loops above those asked for, and leverages.
+
+        values [L, k] and axes [L, k, k] are the eigenvalues and eigenvectors of what the solution says of the loops, in
+        the standard deviations that these state.
+        """
+        at, variances, values = self._loops, self._variances(scales), values / scales[1]
         taken = np.where(kept, self._counts_for(kept), 0.0)[at]
-        distance, spread = _studentised(z, L, taken)
+        distance, spread = _studentised(self._errors(poses, variances, at), values, axes, taken)
         stated = np.log(self._values[at]).sum(axis=1) - self._dof[at] * np.log(variances[at])
         # the space as it is now: that of odometry may be many times too large
         smaller = math.log(extent(poses[:, :-1, -1]) / self._space_m)
         share = self._share(kept)
         evidence = 0.5 * (stated - spread - distance) + math.log(share / (1.0 - share))
         evidence += np.minimum(self._dof[at], self._problem.dimension) * min(smaller, 0.0)
-        leverage = taken * np.einsum("eaa->e", L) / np.maximum(self._dof[at], 1)
+        leverage = taken * values.sum(axis=1) / np.maximum(self._dof[at], 1)
         return np.minimum(evidence, 0.5 * (self._limit[at] - distance)) - _ODDS, leverage
 
     def _share(self, kept: Mask) -> float:
         count, held = len(self._loops), int(kept[self._loops].sum())
         return min(max((held + 1.0) / (count + 2.0), 0.02), 0.98)
 
-    def _whitened(self, poses: Array, S: Array, variances: Array, at: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return errors [M, k] in standard deviations along known axes, and S in the same units [M, k, k]."""
+    def _in_sigmas(self, S: Array, variances: Array, at: NDArray[np.int64]) -> Array:
+        """Return covariances S [M, k, k] in standard deviations of the edges `at` along known axes."""
         V = self._axes[at]
         root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
         inner = V.transpose(0, 2, 1) @ (S / np.outer(self._spread, self._spread)) @ V
-        return self._errors(poses, variances, at), inner * root[:, :, None] * root[:, None, :]
+        return np.asarray(inner * root[:, :, None] * root[:, None, :])
 
     def _errors(self, poses: Array, variances: Array, at: NDArray[np.int64]) -> Array:
+        """Return errors [M, k] of the edges `at` in their standard deviations along known axes."""
         r = self._problem.residuals(poses)[at] / self._spread
         root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
         return np.einsum("eab,ea->eb", self._axes[at], r) * root
@@ -284,13 +311,13 @@ def _along(problem: PoseGraphProblem, poses: Array, place_m: float) -> Array:
     return np.column_stack([np.arange(len(poses)) / PLACE, np.cumsum(steps) / place_m])
 
 
-def _studentised(z: Array, L: Array, taken: Array) -> tuple[Array, Array]:
+def _studentised(z: Array, values: Array, axes: Array, taken: Array) -> tuple[Array, Array]:
     """Return the squared length of innovations [M] in their standard deviations, and log det of their covariance.
 
-    z [M, k] are errors and L [M, k, k] covariances of the solution, in the loop's standard deviations; the solution has
-    taken the loop with the weight `taken` [M] (0: not at all), which is undone.
+    z [M, k] are errors, values [M, k] and axes [M, k, k] eigenvalues and eigenvectors of covariances of the solution,
+    in the loop's standard deviations; the solution has taken the loop with the weight `taken` [M] (0: not at all),
+    which is undone.
     """
-    values, axes = np.linalg.eigh(L)
     values = np.maximum(values, 0.0)
     without = np.maximum(1.0 - taken[:, None] * values, 1.0 - _LEVERAGE_MAX)
     variances = 1.0 + values / without
