@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from vislam.batch.posegraph.problem import RelativePoses
 from vislam.config import GraphConfig, MachineConfig
 from vislam.core.errors import DataError
-from vislam.core.geometry import are_rotations, invert
+from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.factors import motion
 from vislam.factors.builder import of_vision
 from vislam.factors.factor_log import FactorLog
-from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
+from vislam.factors.journal import KeyframeRecord, checked_poses, keyframe_records, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
 from vislam.factors.motion import SUBMAP_SIGMA_DEG, start_factors
 from vislam.factors.noise_models import DIRECTION_SCALE_SIGMA, gaussian, huber
@@ -43,15 +43,14 @@ class Chain:
         self._lever_m = log.rig.T_body_cam0[:3, 3]
         self.has_imu = log.first_state is not None and log.noise is not None
         first = log.first_state if self.has_imu else None
-        self.start = start_record(first, _rigid(log.keyframes[0].T_map_body, "keyframe 0"))
+        self.start = start_record(first, log.keyframes[0].T_map_body)
         self._preintegrator = None
         if self.has_imu and log.noise is not None:
             self._preintegrator = Preintegrator(config, log.noise, self._machine)
-        self.records: list[KeyframeRecord] = []
-        for keyframe in log.keyframes:
-            self.records.append(keyframe_record(keyframe.packet, self.records[-1] if self.records else None))
-        self.poses = np.array([_rigid(k.T_map_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
-        odom = np.array([_rigid(k.T_odom_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
+        self.records = keyframe_records([keyframe.packet for keyframe in log.keyframes])
+        whats = [f"the factor log's keyframe {i}" for i in range(len(log.keyframes))]
+        self.poses = checked_poses([k.T_map_body for k in log.keyframes], whats)
+        odom = checked_poses([k.T_odom_body for k in log.keyframes], whats)
         self._odometry = np.array([invert(a) @ b for a, b in pairwise(odom)]).reshape(-1, 4, 4)
         if not self.has_imu and any(not r.has_scale for r in self.records[1:]):
             raise DataError("the run is of one camera without an IMU: nothing in it shows scale")
@@ -186,10 +185,3 @@ def _duration_s(before: KeyframeRecord, record: KeyframeRecord) -> float:
     """Return the seconds between two keyframes; before a new submap, whose clock may begin again, at least one."""
     duration_s = (record.t_ns - before.t_ns) * 1e-9
     return max(duration_s, 1.0) if record.begins_submap else duration_s
-
-
-def _rigid(T: Array, what: str) -> Array:
-    """Return a pose of the log made exactly rigid; raises DataError on damage."""
-    if not np.isfinite(T).all() or not are_rotations(T[:3, :3], 1e-3):
-        raise DataError(f"{what}: the pose in the factor log is not a rigid motion; run the recording again")
-    return nearest_rigid(T)
