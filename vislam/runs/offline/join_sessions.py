@@ -25,7 +25,7 @@ from vislam.factors import LoopModel, loop_record
 from vislam.graph.joining import JOIN_FRAMES, RelativeCovariance, Waiting
 from vislam.loop import LoopCloser
 from vislam.runs.folder import storage
-from vislam.runs.offline.session_graph import SessionPart, read_part, weak_links
+from vislam.runs.offline.session_graph import SessionPart, read_part
 from vislam.trajectory import Trajectory, write_tum
 
 
@@ -218,7 +218,7 @@ def _optimised(
     suspects = [m for m in models if search.submaps.are_joined(m.record.from_id, m.record.to_id)]
     _check_joined(parts, search, suspects, len(models))
     edges = RelativePoses.joined([search.edges, loop_edges(suspects, search.poses)])
-    for k in weak_links(search.submaps):  # nothing was measured: they say what the placed submaps say
+    for k in filter(None, search.submaps.first_ids):  # nothing was measured before: they say what placed submaps say
         at = np.flatnonzero(np.all(search.edges.ends == (k - 1, k), axis=1))
         edges.T_from_to[at] = invert(search.poses[k - 1]) @ search.poses[k]
     problem = edges.problem(search.poses)

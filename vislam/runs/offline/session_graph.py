@@ -86,11 +86,6 @@ def read_part(path: Path, name: str) -> SessionPart:
     return SessionPart(path, name, config, rig, log.rig, memory, log.frames, first_id, submaps, edges)
 
 
-def weak_links(submaps: Submaps) -> list[int]:
-    """Return the keyframes before which nothing was measured."""
-    return [k for k in submaps.first_ids if k]
-
-
 def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> RelativePoses:
     """Return odometry as the window of tight coupling summarised it."""
     odometry = WindowOdometry(config.graph, config.machine)
