@@ -28,7 +28,7 @@ from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
-from vislam.factors.evidence import APART, PLACE, SOUND, extent
+from vislam.factors.loop_evidence import APART, PLACE, SOUND, extent
 
 Mask = NDArray[np.bool_]
 

@@ -20,7 +20,7 @@ from vislam.batch.posegraph.starts import odometry_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
-from vislam.factors.evidence import SOUND, entering, innovation, log_volume
+from vislam.factors.loop_evidence import SOUND, entering, innovation, log_volume
 
 Mask = NDArray[np.bool_]
 

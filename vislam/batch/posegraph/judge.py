@@ -25,7 +25,7 @@ from vislam.batch.posegraph.solver import levenberg_marquardt
 from vislam.batch.posegraph.structure import Structure
 from vislam.core.chi_square import chi_square_limits
 from vislam.core.messages import Array
-from vislam.factors.evidence import PLACE, SOUND, entering, extent, spread
+from vislam.factors.loop_evidence import PLACE, SOUND, entering, extent, spread
 
 Mask = NDArray[np.bool_]
 
@@ -92,6 +92,9 @@ class Judge:
         self._dof = self._known.sum(axis=1)
         self._limit = _TAILS * chi_square_limits(probability, np.maximum(self._dof, 1))
         self._medians = chi_square_limits(0.5, np.maximum(self._dof, 1))
+        self._tree = cKDTree(self._ends(self._loops)) if len(self._loops) else None
+        # how many of the loops kept join the same two places as each loop, itself among them, and which these are
+        self._alike, self._counted = np.zeros(len(self._loops)), np.zeros(len(self._loops), dtype=np.bool_)
         self._newest: tuple[Mask, Structure, Array] | None = None  # of the edges kept that were asked for last
 
     def supposing(self, found: Judgement) -> Judgement:
@@ -178,8 +181,9 @@ class Judge:
     def _of(self, kept: Mask) -> tuple[Structure, Array]:
         """Return the structure of the edges kept [E], and for what share of itself each edge counts."""
         if self._newest is None or self._newest[0] is not kept:
-            at, counts_for = self._loops[kept[self._loops]], np.ones(len(kept))
-            counts_for[at] = 1.0 / self._alike(at)
+            self._count(kept[self._loops])
+            counts_for = np.ones(len(kept))
+            counts_for[self._loops] = 1.0 / np.maximum(self._alike, 1)
             self._newest = kept, Structure(self._problem.with_edges(kept)), counts_for
         return self._newest[1:]
 
@@ -197,12 +201,18 @@ class Judge:
         structure, weights = self._of(kept)[0], self._weights(kept, scales)
         return covariances_of_edges(structure, self._problem, poses, weights, at, kept[at])[0]
 
-    def _alike(self, loops: NDArray[np.int64]) -> Array:
-        """Return how many of the loops [M] (indices of edges) join the same two places as each, itself among them."""
-        if not len(loops):
-            return np.ones(0)
-        ends = self._ends(loops)
-        return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
+    def _count(self, kept: Mask) -> None:
+        """Count again, for the loops kept [L], those alike; of few that changed, around these alone."""
+        changed = np.flatnonzero(kept != self._counted)
+        if self._tree is None or not len(changed):
+            return
+        ends, self._counted = np.asarray(self._tree.data), kept
+        if len(changed) > _CHANGED * len(kept):
+            held = cKDTree(ends[kept]) if kept.any() else None
+            self._alike = np.zeros(len(kept)) if held is None else _counted_within(held, ends)
+            return
+        for loop, near in zip(changed, self._tree.query_ball_point(ends[changed], 1.0, p=np.inf), strict=True):
+            self._alike[near] += 1.0 if kept[loop] else -1.0
 
     def _calibrated(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> tuple[Array, tuple[float, float]]:
         """Return the optimum of the edges kept, with variances scaled by what residuals of a sample of them show."""
@@ -302,6 +312,11 @@ class Judge:
         r = self._problem.residuals(poses)[at] / self._spread
         root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
         return np.einsum("eab,ea->eb", self._axes[at], r) * root
+
+
+def _counted_within(tree: cKDTree, ends: Array) -> Array:
+    """Return how many points of a tree are at the same two places as each of the ends [M, 4]."""
+    return np.asarray(tree.query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
 
 
 def _along(problem: PoseGraphProblem, poses: Array, place_m: float) -> Array:

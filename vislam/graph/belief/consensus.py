@@ -21,12 +21,12 @@ import numpy as np
 from vislam.config import GraphConfig
 from vislam.core.geometry import invert
 from vislam.core.messages import Array
-from vislam.factors.evidence import APART, LADDER, SOUND, innovation, log_volume
 from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.loop_evidence import APART, LADDER, SOUND, innovation, log_volume
 from vislam.factors.motion import GAUGE_SIGMA
 from vislam.factors.noise_models import gaussian
-from vislam.factors.solvers import FAILURES, Factorization, IncrementalSolver
+from vislam.factors.solvers import FAILURES, Factorization, IncrementalSolver, graph_of
 from vislam.factors.visual import pose_factor
 from vislam.graph.belief.witnesses import EXPECTED, Witnesses, confirming
 from vislam.graph.travel import Chain, Travel
@@ -291,21 +291,24 @@ class _SmallGraph:
 
     def build(self, touched: set[int]) -> Generator[None]:
         """Put keyframes into the graph."""
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        factors, values = list[gtsam.NonlinearFactor](), gtsam.Values()
         before = -1
         for count, k in enumerate(sorted(touched)):
             values.insert(X(k), gtsam.Pose3(self._chain.poses[k]))
             if before < 0:
                 gauge = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
-                factors.add(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(self._chain.poses[k]), gauge))
+                factors.append(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(self._chain.poses[k]), gauge))
             else:
-                T, covariance = self._chain.motion(before, k)
-                factors.add(pose_factor(X(before), X(k), T, gaussian(self._scale**2 * covariance, _RATIO_MAX)))
+                factors.append(self._odometry(before, k, *self._chain.motion(before, k)))
             before = k
             if count % _NODES == _NODES - 1:
                 yield
-        self._solver.update(factors, values, [])
+        self._solver.update(graph_of(factors), values, [])
         self._nodes = sorted(touched)
+
+    def _odometry(self, a: int, b: int, T_a_b: Array, covariance: Array) -> gtsam.BetweenFactorPose3:
+        """Return the factor of odometry summed up from keyframe a to b."""
+        return pose_factor(X(a), X(b), T_a_b, gaussian(self._scale**2 * covariance, _RATIO_MAX))
 
     def _reach(self, loops: Sequence[LoopModel]) -> None:
         """Put the ends of loops into the graph where they are not."""
@@ -313,11 +316,10 @@ class _SmallGraph:
             nearest = min(self._nodes, key=lambda n: abs(n - k))
             a, b = min(nearest, k), max(nearest, k)
             T, covariance = self._chain.motion(a, b)
-            factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-            factors.add(pose_factor(X(a), X(b), T, gaussian(self._scale**2 * covariance, _RATIO_MAX)))
+            factor, values = self._odometry(a, b, T, covariance), gtsam.Values()
             T_map_nearest = self._solver.estimate([X(nearest)]).atPose3(X(nearest)).matrix()
             values.insert(X(k), gtsam.Pose3(nearest_rigid(T_map_nearest @ (T if k == b else invert(T)))))
-            self._solver.update(factors, values, [])
+            self._solver.update(graph_of([factor]), values, [])
             insort(self._nodes, k)
 
     def test(self, loop: LoopModel) -> tuple[float, float]:
@@ -333,10 +335,8 @@ class _SmallGraph:
         """Put loops into the graph."""
         if not loops:
             return
-        factors = gtsam.NonlinearFactorGraph()
-        for loop in loops:
-            factors.add(loop.factor(robust=False, as_measured=True))
-        slots = self._solver.update(factors, gtsam.Values(), [])
+        factors = [loop.factor(robust=False, as_measured=True) for loop in loops]
+        slots = self._solver.update(graph_of(factors), gtsam.Values(), [])
         self._slots |= {loop.id: slot for loop, slot in zip(loops, slots, strict=True)}
         self._solver.iterate(1)
 

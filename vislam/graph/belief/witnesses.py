@@ -11,8 +11,8 @@ from vislam.config import GraphConfig
 from vislam.core.angles import angles_of
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, invert_many, so3_log
-from vislam.factors.evidence import LADDER, PLACE, log_volume
 from vislam.factors.loop import LoopModel
+from vislam.factors.loop_evidence import LADDER, PLACE, log_volume
 from vislam.graph.travel import Chain, Travel
 
 _WITNESS_M = 1.0  # loops that start and end at the places of another's, or whose ends lie so near to its ends ...

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from vislam.factors.evidence import SOUND, entering, innovation, log_volume
+from vislam.factors.loop_evidence import SOUND, entering, innovation, log_volume
 
 
 def test_the_volume_is_that_of_the_box_and_of_all_rotations() -> None:
