@@ -1,8 +1,8 @@
-"""What speaks for loops: the density of what each says if it is true, against that of a false one.
+"""What speaks for loops: the density of what each claims if it is true, against that of a false one.
 
-A false loop may say anything in the space of the trajectory. One volume of that space, one ladder of evidence, one idea
-of a place: for the loops of a run as they come (`graph.belief`), and for those of finished runs, of sessions that are
-joined and of files, which are decided as a whole (`batch.posegraph`).
+A false loop may claim anything in the space of the trajectory. One volume of that space, one ladder of evidence, one
+idea of a place: for the loops of a run as they come (`graph.belief`), and for those of finished runs, of sessions that
+are joined and of files, which are decided as a whole (`batch.posegraph`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 SOUND = 4.0  # log-odds from which on a loop is believed by itself
 LADDER = (16.0, 12.0, 8.0, SOUND, 2.0, 0.0)  # log-odds of a loop that enters; lower ones once there is nothing above
 APART = 8.0  # log-likelihood by which one set of loops must be likelier than another that contradicts it
-PLACE = 10  # poses that follow each other make one place, at most so many before and behind each
+PLACE = 10  # poses that follow each other make one place, at most this number before and behind each
 _ROTATION = {2: 2.0 * math.pi, 3: (8.0 * math.pi**2) ** (1.0 / 3.0)}  # sides of the box of all rotations, in rad
 
 
@@ -30,9 +30,9 @@ def extent(positions: Array) -> float:
 
 
 def spread(positions: Array) -> Array:
-    """Return the sigmas [k] of what a false loop says, rotation first: a Gaussian with the box's density at its peak.
+    """Return the sigmas [k], rotation first, of a Gaussian whose density at its peak is that of a false loop.
 
-    `positions` [N, d] are the trajectory's.
+    `positions` [N, d] are the trajectory's: within their box a false loop may put a pose, turned in any way.
     """
     d = positions.shape[1]
     sides = [*[_ROTATION[d]] * (2 * d - 3), *[extent(positions)] * d]
@@ -40,7 +40,7 @@ def spread(positions: Array) -> Array:
 
 
 def log_volume(positions: Array) -> float:
-    """Return the logarithm of the volume of the relative poses that a false loop may claim: evidence of any but it."""
+    """Return the logarithm of the volume of the relative poses that a false loop may claim, in rad and m."""
     return float(np.sum(np.log(math.sqrt(2.0 * math.pi) * spread(positions))))
 
 

@@ -103,7 +103,7 @@ class Chain:
         return RelativePoses.of([(r.id - 1, r.id) for r in self.records[1:]], [measurement_of(f) for f in factors])
 
     def _odometry_edge(self, before: KeyframeRecord, record: KeyframeRecord) -> gtsam.BetweenFactorPose3:
-        """Return what the run's own odometry says of the motion to a keyframe."""
+        """Return what the run's own odometry states of the motion to a keyframe."""
         if record.begins_submap:
             return self._weak_link(record, robust=False)
         T = self._odometry[record.id - 1]

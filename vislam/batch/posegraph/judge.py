@@ -281,7 +281,7 @@ class Judge:
     ) -> tuple[Array, Array]:
         """Return log-odds of all loops above those asked for, and leverages.
 
-        values [L, k] and axes [L, k, k] are the eigenvalues and eigenvectors of what the solution says of the loops, in
+        values [L, k] and axes [L, k, k] are the eigenvalues and eigenvectors of what the solution knows of the loops, in
         the standard deviations that these state.
         """
         at, variances, values = self._loops, self._variances(scales), values / scales[1]
