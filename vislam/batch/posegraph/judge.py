@@ -281,8 +281,8 @@ class Judge:
     ) -> tuple[Array, Array]:
         """Return log-odds of all loops above those asked for, and leverages.
 
-        values [L, k] and axes [L, k, k] are the eigenvalues and eigenvectors of what the solution knows of the loops, in
-        the standard deviations that these state.
+        values [L, k] and axes [L, k, k] are the eigenvalues and eigenvectors of the loops' covariances by the solution,
+        in the standard deviations that they state.
         """
         at, variances, values = self._loops, self._variances(scales), values / scales[1]
         taken = np.where(kept, self._counts_for(kept), 0.0)[at]
