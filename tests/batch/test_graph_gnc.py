@@ -25,13 +25,14 @@ def _with_false_loops(problem, count, seed):
     )
 
 
+@pytest.mark.parametrize("robust", ["gnc", "auto"])
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("overstated", [1.0, 1e4])
-def test_half_of_the_loops_may_be_false(d, overstated):
+def test_half_of_the_loops_may_be_false(d, overstated, robust):
     problem, _ = world(d, n=120, loops=60, seed=3)
     problem = replace(problem, information=problem.information / overstated)
     clean = optimize_pose_graph(problem)
-    robust = optimize_pose_graph(_with_false_loops(problem, 60, seed=4), PoseGraphConfig(robust="gnc"))
+    robust = optimize_pose_graph(_with_false_loops(problem, 60, seed=4), PoseGraphConfig(robust=robust))
     true, false = robust.weights[: len(problem.edges)], robust.weights[len(problem.edges) :]
     assert false.sum() == 0
     assert true.mean() > 0.97
@@ -41,15 +42,17 @@ def test_half_of_the_loops_may_be_false(d, overstated):
     assert np.abs(plain.poses - clean.poses)[:, :d, d].max() > 1.0
 
 
+@pytest.mark.parametrize("robust", ["gnc", "auto"])
 @pytest.mark.parametrize("d", [2, 3])
-def test_without_false_loops_nothing_is_lost(d):
+def test_without_false_loops_nothing_is_lost(d, robust):
     problem, _ = world(d, n=80, loops=50, seed=5)
-    robust = optimize_pose_graph(problem, PoseGraphConfig(robust="gnc"))
-    assert robust.weights.mean() > 0.97
+    assert optimize_pose_graph(problem, PoseGraphConfig(robust=robust)).weights.mean() > 0.97
     chain = replace(
         problem, edges=problem.edges[:79], measurements=problem.measurements[:79], information=problem.information[:79]
     )
-    assert optimize_pose_graph(chain, PoseGraphConfig(robust="gnc")).weights.tolist() == [1.0] * 79
+    alone = optimize_pose_graph(chain, PoseGraphConfig(robust=robust))
+    assert alone.weights.tolist() == [1.0] * 79
+    assert alone.undecided == ()
 
 
 def test_parts_are_joined_once_whole():

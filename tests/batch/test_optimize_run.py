@@ -182,6 +182,17 @@ def test_a_gap_without_imu_keeps_the_chain():
     assert np.linalg.norm(after[0][:3, 3] - after[1][:3, 3]) < 0.03
 
 
+def test_loops_of_a_run_whose_submap_is_tied_by_habit_are_judged():
+    run = simulate("stereo", imu=False)
+
+    def begins(packet):
+        habit = replace(packet.vo, covariance=0.01 * np.eye(6), tracking=Tracking.LOST)
+        return replace(packet, begins_submap=True, vo=habit)
+
+    result = optimize_run(changed(run.log, {len(run.log.keyframes) // 2}, begins), QUICK)
+    assert [verdict.kept for verdict in result.loops] == [True] * len(run.log.edges)
+
+
 def test_without_any_track_the_pose_graph_remains():
     run = simulate("stereo", duration_s=8.0, true_loops=0)
     result = optimize_run(changed(run.log, range(len(run.log.keyframes)), blind), QUICK)

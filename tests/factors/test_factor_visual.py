@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vislam.core.geometry import invert, se3_exp, tangent_basis, transform
-from vislam.factors.noise_models import gaussian
+from vislam.factors.noise_models import DIRECTION_FLOOR_DEG, gaussian
 from vislam.factors.visual import (
     direction_as_pose,
     direction_factor,
@@ -110,9 +110,8 @@ def test_direction_as_pose_lets_scale_go_and_holds_direction(seed: int) -> None:
     measured, t = _measure(T_a, T_b)
     sigma = 0.01
     covariance = np.diag([1e-6] * 3 + [sigma**2] * 3)
-    mean, out = direction_as_pose(
-        measured, covariance, LEVER_M, float(np.linalg.norm(t)), floor_rad=0.0, scale_sigma=5.0
-    )
+    covariance[3:, 3:] -= np.deg2rad(DIRECTION_FLOOR_DEG) ** 2 * np.eye(3)  # which it adds
+    mean, out = direction_as_pose(measured, covariance, LEVER_M, invert(T_a) @ T_b)
     np.testing.assert_allclose(mean, invert(T_a) @ T_b, atol=1e-12)
     R = measured[:3, :3]
 

@@ -12,13 +12,13 @@ import pytest
 from session_entries import editing
 from vislam.batch import DaskTeam, dask_client, read_pose_graph
 from vislam.batch.posegraph.auto import decide
+from vislam.batch.posegraph.problem import RelativePoses
 from vislam.cli import run_verb
 from vislam.config import PoseGraphConfig, load
 from vislam.core.geometry import invert, se3_exp, transform
 from vislam.runs import execute
 from vislam.runs.folder import prepare
 from vislam.runs.offline.join_sessions import join_sessions
-from vislam.runs.offline.session_graph import Edges, problem_of
 from vislam.runs.sources import open_source
 from vislam.trajectory import Trajectory, read_tum
 
@@ -171,7 +171,7 @@ def test_false_loops_between_are_rejected_and_odometry_is_not():
     measured = [invert(poses[a]) @ poses[b] @ se3_exp(sigma * rng.standard_normal(6)) for a, b in ends]
     measured += [se3_exp(np.array([0.0, 0.0, 0.3, 0.4, -0.3, 0.1])) for _ in false]
     information = np.tile(np.diag(sigma**-2), (len(ends) + len(false), 1, 1))
-    problem = problem_of(poses, Edges(np.array(ends + false), np.array(measured), information))
+    problem = RelativePoses(np.array(ends + false), np.array(measured), information).problem(poses)
     suspects = np.arange(len(ends) + len(false)) >= 2 * (count - 1)
     weights = decide(problem, PoseGraphConfig(), doubtful=suspects).weights
     assert np.flatnonzero(weights == 0.0).tolist() == list(range(len(ends), len(ends) + len(false)))

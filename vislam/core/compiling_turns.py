@@ -16,7 +16,7 @@ class CacheInTurns(FunctionCache):  # type: ignore[misc]
     """A kernel's cache: what it lacks is compiled by one process at a time.
 
     Who finds nothing locks a file beside the kernel's until its code is stored. The system undoes the lock of a process
-    that dies. Callees are compiled within their callers' turns; no kernel calls itself, so there is no circle of waiting.
+    that dies. Callees are compiled within their callers' turns; as no kernel calls itself, none waits in a circle.
     """
 
     _turn: int | None = None  # descriptor of the locked file

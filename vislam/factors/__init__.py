@@ -16,11 +16,10 @@ if TYPE_CHECKING:
         state_data,
         state_from,
     )
-    from vislam.factors.journal import LoopRecord, checked_pose, loop_record
+    from vislam.factors.journal import checked_pose, loop_record
     from vislam.factors.keys import nearest_rigid
     from vislam.factors.loop import LoopModel
     from vislam.factors.noise_models import checked_covariance, conditioned
-    from vislam.factors.visual import measurement_of
     from vislam.factors.window import WindowOdometry
 
 __all__ = [
@@ -28,13 +27,11 @@ __all__ = [
     "LoggedEdge",
     "LoggedKeyframe",
     "LoopModel",
-    "LoopRecord",
     "WindowOdometry",
     "checked_covariance",
     "checked_pose",
     "conditioned",
     "loop_record",
-    "measurement_of",
     "nearest_rigid",
     "rig_data",
     "rig_from",
@@ -47,10 +44,9 @@ __getattr__ = late(
     {
         "FactorLog LoggedEdge LoggedKeyframe rig_data rig_from state_data state_from": "vislam.factors.factor_log",
         "LoopModel": "vislam.factors.loop",
-        "LoopRecord checked_pose loop_record": "vislam.factors.journal",
+        "checked_pose loop_record": "vislam.factors.journal",
         "WindowOdometry": "vislam.factors.window",
         "checked_covariance conditioned": "vislam.factors.noise_models",
-        "measurement_of": "vislam.factors.visual",
         "nearest_rigid": "vislam.factors.keys",
     },
 )

@@ -14,14 +14,7 @@ from vislam.factors import motion
 from vislam.factors.journal import KeyframeRecord, StartRecord
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
 from vislam.factors.motion import start_factors
-from vislam.factors.noise_models import (
-    DIRECTION_FLOOR_DEG,
-    DIRECTION_SCALE_SIGMA,
-    DIRECTION_SOFT_M,
-    gaussian,
-    huber,
-    inflated,
-)
+from vislam.factors.noise_models import gaussian, huber, inflated
 from vislam.factors.preintegration import Preintegrated, Preintegrator
 from vislam.factors.visual import direction_as_pose, pose_factor
 from vislam.imu import ImuNoise
@@ -146,17 +139,8 @@ class Builder:
         a, b = X(record.id - 1), X(record.id)
         T = record.T_previous_body
         if not record.has_scale:
-            lever = self._lever_m
             moved = invert(before.T_map_body) @ guess.T_map_body
-            step_m = float(np.linalg.norm(moved[:3, 3] + moved[:3, :3] @ lever - lever))
-            T, covariance = direction_as_pose(
-                T,
-                covariance,
-                lever,
-                max(step_m, DIRECTION_SOFT_M),
-                floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG),
-                scale_sigma=DIRECTION_SCALE_SIGMA,
-            )
+            T, covariance = direction_as_pose(T, covariance, self._lever_m, moved)
         model = huber(gaussian(covariance, config.covariance_ratio_max), config.huber_k)
         return pose_factor(a, b, T, model)
 

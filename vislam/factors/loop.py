@@ -24,7 +24,6 @@ from vislam.factors.visual import (
 
 LOOP_CAUCHY_K = 2.0  # whitened norm
 LOOP_MIN_WEIGHT = 0.05  # a loop that optimisation leaves with less is taken out again
-_SCALE_SIGMA = 5.0  # relative, on the length of the way of a loop that did not measure it
 _RATIO_MAX = 1e12  # eigenvalues of an innovation covariance, for a stable inverse
 
 
@@ -59,7 +58,7 @@ class LoopModel:
         and keeps the variance along the way of a length that was not measured. Returns False, and changes nothing,
         where that would add more than `most` times the loop's own variance in rotation or translation.
         """
-        T, own = self._as_pose(T_from_to)
+        T, own = self.as_pose(T_from_to)
         carry = se3_adjoint(invert(T))
         added = carry @ covariance @ carry.T
         if any(np.trace(added[n, n]) > most * np.trace(own[n, n]) for n in (slice(3), slice(3, 6))):
@@ -67,18 +66,13 @@ class LoopModel:
         self.tie = Tie(anchor_id, nearest_rigid(T_anchor_from @ T), own + added)
         return True
 
-    def _as_pose(self, T_from_to: Array) -> tuple[Array, Array]:
-        """Return the loop as a metric relative pose [4, 4] with covariance [6, 6], near the graph's own T_from_to."""
-        config, record = self._config, self.record
+    def as_pose(self, T_from_to: Array) -> tuple[Array, Array]:
+        """Return the loop as a metric relative pose [4, 4] with covariance [6, 6]; T_from_to [4, 4] lends it length."""
+        record = self.record
         if self._direction is None:
             return record.T_from_to, self.covariance
-        moved = T_from_to[:3, 3] + (T_from_to[:3, :3] - np.eye(3)) @ self._lever_m
-        floor = np.deg2rad(DIRECTION_FLOOR_DEG)
-        covariance = inflated(record.covariance, 1.0, np.deg2rad(config.loop_floor_deg), 0.0)
-        return direction_as_pose(
-            record.T_from_to, covariance, self._lever_m, max(float(np.linalg.norm(moved)), DIRECTION_SOFT_M),
-            floor_rad=floor, scale_sigma=_SCALE_SIGMA,
-        )  # fmt: skip
+        covariance = inflated(record.covariance, 1.0, np.deg2rad(self._config.loop_floor_deg), 0.0)
+        return direction_as_pose(record.T_from_to, covariance, self._lever_m, T_from_to)
 
     def factor(self, robust: bool, as_measured: bool = False) -> gtsam.NonlinearFactor:
         """Return the factor, under a Cauchy kernel when `robust`, between the loop's own ends when `as_measured`."""
@@ -93,6 +87,16 @@ class LoopModel:
         if self._direction is None or tie is self.tie:
             return pose_factor(a, b, tie.T_from_to, model)
         return direction_factor(a, b, self._direction, lever_m=self._lever_m, soft_m=DIRECTION_SOFT_M, model=model)
+
+    def between(self, poses: Array, robust: bool) -> gtsam.BetweenFactorPose3:
+        """Return a factor that is metric also without scale, for which poses [K, 4, 4] lend the length; see `factor`.
+
+        Batch has no need of a function in Python per loop, which `factor` makes of one without scale.
+        """
+        a, b = self.record.from_id, self.record.to_id
+        T, covariance = self.as_pose(invert(poses[a]) @ poses[b])
+        model: gtsam.noiseModel.Base = gaussian(covariance, self._config.covariance_ratio_max)
+        return pose_factor(X(a), X(b), T, cauchy(model, LOOP_CAUCHY_K) if robust else model)
 
     def eye(self, T_map_body: Array) -> Array:
         """Return where cam0 is [3], to which the direction of a loop without scale belongs."""

@@ -34,6 +34,12 @@ class Odometry(Protocol):
     def changed(self, vo_scale: float) -> dict[Label, gtsam.NonlinearFactor]:
         """Return factors about older keyframes that came or changed with the newest one."""
 
+    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
+        """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
+
+    def relink(self, k: int, T_previous_body: Array) -> None:
+        """Give the link with which keyframe k begins a submap that motion [4, 4], with its covariance as before."""
+
     def reach_m(self, k: int) -> float:
         """Return how far keyframe k can be from the one before; an estimate beyond has diverged."""
 
@@ -86,6 +92,10 @@ class MotionOdometry:
         """See Odometry; what was measured here never changes."""
         return {}
 
+    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
+        """See Odometry."""
+        return []
+
     def reach_m(self, k: int) -> float:
         """See Odometry."""
         if self._records[k].begins_submap:
@@ -97,5 +107,5 @@ class MotionOdometry:
         return None
 
     def relink(self, k: int, T_previous_body: Array) -> None:
-        """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
+        """See Odometry."""
         self._records[k] = replace(self._records[k], T_previous_body=nearest_rigid(T_previous_body))

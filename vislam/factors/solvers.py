@@ -6,6 +6,7 @@ exception passes through, and the owner builds a new solver from its journal.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, Protocol
 
 import gtsam
@@ -101,7 +102,7 @@ class IncrementalSolver:
 
     def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
         """See Solver."""
-        return _some(self._isam.getFactorsUnsafe(), slots)
+        return graph_of(map(self._isam.getFactorsUnsafe().at, slots))
 
     def iterate(self, count: int) -> None:
         """See Solver."""
@@ -151,7 +152,7 @@ class BatchSolver:
 
     def factors(self, slots: list[int]) -> gtsam.NonlinearFactorGraph:
         """See Solver."""
-        return _some(self._graph, slots)
+        return graph_of(map(self._graph.at, slots))
 
     def iterate(self, count: int) -> None:
         """See Solver; keeps the values it has when even LM fails."""
@@ -185,8 +186,9 @@ def optimize(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
-def _some(graph: gtsam.NonlinearFactorGraph, slots: list[int]) -> gtsam.NonlinearFactorGraph:
-    some = gtsam.NonlinearFactorGraph()
-    for slot in slots:
-        some.add(graph.at(slot))
-    return some
+def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    """Return factors as a graph."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph

@@ -10,6 +10,7 @@ import numpy as np
 from vislam.core.geometry import skew, so3_log, so3_right_jacobian_inverse, tangent_basis
 from vislam.core.jit import njit
 from vislam.core.messages import Array
+from vislam.factors.noise_models import DIRECTION_FLOOR_DEG, DIRECTION_SCALE_SIGMA, DIRECTION_SOFT_M
 
 _FACING_MIN = 0.1  # bounds the residual near the opposite direction
 _NO_DIRECTION = 0.5  # a translation column shorter than this means no parallax
@@ -47,18 +48,20 @@ def direction_measurement(T_a_b: Array, covariance: Array, floor_rad: float) -> 
 
 
 def direction_as_pose(
-    T_a_b: Array, covariance: Array, lever_m: Array, step_m: float, *, floor_rad: float, scale_sigma: float
+    T_a_b: Array, covariance: Array, lever_m: Array, T_expected: Array, scale_sigma: float = DIRECTION_SCALE_SIGMA
 ) -> tuple[Array, Array]:
     """Return an unscaled relative pose as a metric one [4, 4] with covariance [6, 6], long along the unknown scale.
 
     All poses whose camera moved along the measured direction lie on a line, t = s d - (R - 1) lever, so a covariance
-    that is long along d states exactly what was measured. `step_m` is the expected length of the step: it places the
-    mean, with `scale_sigma` relative uncertainty, and turns the direction's angle into metres.
+    that is long along d states exactly what was measured. The motion `T_expected` [4, 4] lends its length: that places
+    the mean, with `scale_sigma` relative uncertainty, and turns the direction's angle into metres.
 
     A graph full of these needs no Python callback: gtsam copies all its values into each call of a CustomFactor, which
     makes linearising N of them cost N^2 (0.12 s an update at 300 keyframes). Loops are few and use `direction_factor`.
     """
     R = T_a_b[:3, :3]
+    expected_m = float(np.linalg.norm(T_expected[:3, 3] + T_expected[:3, :3] @ lever_m - lever_m))
+    step_m, floor_rad = max(expected_m, DIRECTION_SOFT_M), np.deg2rad(DIRECTION_FLOOR_DEG)
     out = np.eye(6)
     mean = np.eye(4)
     mean[:3, :3] = R

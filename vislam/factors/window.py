@@ -107,7 +107,7 @@ class WindowOdometry:
         return Step(still, guess, *_variances(covariance), note=note, named=named)
 
     def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
-        """Return older keyframes whose edge changed with the newest one, with its variances in rad^2 and m^2."""
+        """See Odometry."""
         assert self._newest is not None
         older = [edge for edge in self._newest.edges if edge.to_id != self._newest.id]
         return [(edge.to_id, *_variances(self.covariance(edge, vo_scale))) for edge in older]
@@ -135,7 +135,7 @@ class WindowOdometry:
         return None if self._shared is None else self._shared.effect(ids, poses)
 
     def relink(self, k: int, T_previous_body: Array) -> None:
-        """Let the link with which keyframe k begins a submap say that motion [4, 4], as loosely as before."""
+        """See Odometry."""
         edge = self._edges[k]
         assert edge is not None
         self._edges[k] = replace(edge, T_previous_body=nearest_rigid(T_previous_body))

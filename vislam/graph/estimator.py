@@ -14,10 +14,10 @@ from vislam.factors.keys import V, X, nearest_rigid
 from vislam.factors.loop import LoopModel
 from vislam.factors.odometry import Odometry
 from vislam.factors.sensed import Readings
-from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS
+from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS, graph_of
 from vislam.graph.estimate import Ids
 from vislam.graph.ladder import Ladder
-from vislam.graph.records import Records, graph_of
+from vislam.graph.records import Records
 from vislam.graph.segments import Segment, SummedUp
 from vislam.graph.settling import let_in, settled
 

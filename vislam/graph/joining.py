@@ -318,7 +318,7 @@ class Joining:
         poses = self._estimator.poses.copy()
         poses[ids] = found.T_map_moved @ poses[ids]
         for k in [k for k in relinked(self.submaps, ids) if k not in self.submaps.tied_ids]:
-            self._source.relink(k, invert(poses[k - 1]) @ poses[k])
+            self._source.odometry.relink(k, invert(poses[k - 1]) @ poses[k])
         notes.append(self._estimator.move(ids, found.T_map_moved))
         notes.append(
             f"submap {found.group}, {len(ids)} keyframes with what it was joined with before, joins an older one"

@@ -23,10 +23,11 @@ from vislam.factors.solvers import (
     Factorization,
     IncrementalSolver,
     Solver,
+    graph_of,
     optimize,
 )
 from vislam.graph.estimate import Estimate, Ids
-from vislam.graph.records import Records, Whole, graph_of
+from vislam.graph.records import Records, Whole
 from vislam.graph.segments import Segment, Summary, SummedUp, joint_beside, summarised
 from vislam.graph.settling import BATCH_ITERATIONS, short
 

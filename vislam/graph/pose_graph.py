@@ -161,7 +161,7 @@ class PoseGraph:
         for k, is_tied in [(record.id, record.is_tied) for record in self._keyframes if record.begins_submap]:
             self._joining.begin(k, is_tied)
             if not is_tied:
-                self._source.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
+                self._source.odometry.relink(k, invert(memory.T_map_body[k - 1]) @ memory.T_map_body[k])
         models = [LoopModel(r, self._config, self._lever_m) for r in self._journal if isinstance(r, LoopRecord)]
         by_place = sort_loops(memory.loops, {m.id: m for m in models})
         in_graph, spare = by_place[LoopPlace.GRAPH], by_place[LoopPlace.SPARE]
@@ -222,7 +222,7 @@ class PoseGraph:
         else:
             step, note = self._estimator.extend()
             self._travel.append(*_variances(record, step), _motion_to(record.id, self._estimator.poses))
-            for older, variance_rad2, variance_m2 in self._source.amended(self._estimator.vo_scale):
+            for older, variance_rad2, variance_m2 in self._source.odometry.amended(self._estimator.vo_scale):
                 self._travel.amend(older, variance_rad2, variance_m2, _motion_to(older, self._estimator.poses))
             notes = [step.note, note]
         self._keyframes.append(record)

@@ -14,6 +14,7 @@ from vislam.factors.loop import LoopModel
 from vislam.factors.motion import held_pose
 from vislam.factors.odometry import Odometry
 from vislam.factors.sensed import Readings
+from vislam.factors.solvers import graph_of
 
 Whole = tuple[gtsam.NonlinearFactorGraph, list[Label | None]]  # all factors, with their names
 
@@ -84,11 +85,3 @@ class Records:
         """Return what errors that all odometry shares do to some variables, if all of them are poses; see Odometry."""
         ids = [key - X(0) for key in keys]
         return self.odometry.shared_error(ids, poses) if all(0 <= k < len(poses) for k in ids) else None
-
-
-def graph_of(factors: list[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    """Return factors as a graph."""
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph

@@ -9,8 +9,8 @@ import gtsam
 
 from vislam.factors.loop import LoopModel
 from vislam.factors.sensed import Readings
-from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS, Solver, optimize
-from vislam.graph.records import Whole, graph_of
+from vislam.factors.solvers import FAILURES, LOOP_ITERATIONS, Solver, graph_of, optimize
+from vislam.graph.records import Whole
 
 BATCH_ITERATIONS = 50
 _ROUNDS, _GAIN = 3, 1e-4  # in which readings are linearised again, at most; a smaller relative gain ends them

@@ -21,10 +21,10 @@ from vislam.factors.solvers import (
     Factorization,
     IncrementalSolver,
     Solver,
+    graph_of,
     optimize,
 )
 from vislam.graph.measurements import ImuBetween, Measurement
-from vislam.graph.records import graph_of
 from vislam.graph.settling import BATCH_ITERATIONS, let_in, short
 
 _IMU_ROUNDS = 3  # of a batch, in which inertial data are integrated at the biases of the one before

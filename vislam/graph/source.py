@@ -79,12 +79,6 @@ class Source(Protocol):
     def take_states(self, newest: NavState | None) -> tuple[tuple[int, NavState], ...]:
         """Return the states of keyframes that are to be remembered since the last call; `newest` is that in map."""
 
-    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
-        """Return older keyframes whose motion is known better now, with its variances per axis in rad^2 and m^2."""
-
-    def relink(self, k: int, T_previous_body: Array) -> None:
-        """Give the link with which keyframe k begins a submap that motion [4, 4], with its covariance as before."""
-
     def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
         """Return the state of keyframe k in map with its covariance, NaN where that is unknown."""
 
@@ -143,14 +137,6 @@ class MotionSource:
     def take_states(self, newest: NavState | None) -> tuple[tuple[int, NavState], ...]:
         """See Source."""
         return () if newest is None else ((self._newest_id, newest),)
-
-    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
-        """See Source."""
-        return []
-
-    def relink(self, k: int, T_previous_body: Array) -> None:
-        """See Source."""
-        self._odometry.relink(k, T_previous_body)
 
     def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
         """See Source; gtsam's covariance turned to NavState's order and axes."""
@@ -251,14 +237,6 @@ class WindowSource:
         """See Source; in the window's frame."""
         fresh, self._fresh = tuple(self._fresh.items()), {}
         return fresh
-
-    def amended(self, vo_scale: float) -> list[tuple[int, float, float]]:
-        """See Source."""
-        return self._odometry.amended(vo_scale)
-
-    def relink(self, k: int, T_previous_body: Array) -> None:
-        """See Source."""
-        self._odometry.relink(k, T_previous_body)
 
     def state(self, k: int, t_ns: int, estimator: Estimator) -> NavState:
         """See Source; the window's state carried to the keyframe's pose in map, whose covariance is the graph's."""

@@ -35,6 +35,7 @@ from vislam.core.messages import Array, NavState
 from vislam.factors.factor_log import FactorLog
 from vislam.factors.keys import B, V, X, nearest_rigid
 from vislam.factors.sensed import Readings
+from vislam.factors.solvers import graph_of
 from vislam.sensors import Suite
 
 _START_GATE_PX = 20.0  # first round: poses of the run may be off, only gross outliers leave
@@ -189,9 +190,7 @@ class _Batch:
         factors += self._loops.factors(self._poses())
         factors += self._readings.factors(self._values)
         factors += self._visual_factors(tracks, first)
-        graph, values, states = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
-        for factor in factors:
-            graph.add(factor)
+        graph, values, states = graph_of(factors), gtsam.Values(), []
         for k in range(count):
             values.insert(X(k), self._values.atPose3(X(k)))
             states.append(X(k))
@@ -227,12 +226,8 @@ class _Batch:
         others = self._graph.size() - int(self._keep.sum())
 
         def graph_at(errors: Array) -> gtsam.NonlinearFactorGraph:
-            graph = gtsam.NonlinearFactorGraph()
-            for i in range(others):
-                graph.add(self._graph.at(i))
-            for factor in self._visual_factors(self._seen.tracks(errors), first=False):
-                graph.add(factor)
-            return graph
+            visual = self._visual_factors(self._seen.tracks(errors), first=False)
+            return graph_of([*(self._graph.at(i) for i in range(others)), *visual])
 
         count, has_imu = len(self._chain.records), self._chain.has_imu
         return profiled(graph_at, self._values, count, self._seen.errors, sigmas, has_imu)

@@ -9,27 +9,23 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from vislam.batch.posegraph.problem import RelativePoses
 from vislam.config import GraphConfig, MachineConfig
 from vislam.core.errors import DataError
-from vislam.core.geometry import are_rotations, invert
+from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.factors import motion
 from vislam.factors.builder import of_vision
 from vislam.factors.factor_log import FactorLog
-from vislam.factors.journal import KeyframeRecord, keyframe_record, start_record
+from vislam.factors.journal import KeyframeRecord, checked_poses, keyframe_records, start_record
 from vislam.factors.keys import B, V, X, bias_of, nearest_rigid
 from vislam.factors.motion import SUBMAP_SIGMA_DEG, start_factors
-from vislam.factors.noise_models import (
-    DIRECTION_FLOOR_DEG,
-    DIRECTION_SCALE_SIGMA,
-    DIRECTION_SOFT_M,
-    gaussian,
-    huber,
-)
+from vislam.factors.noise_models import DIRECTION_SCALE_SIGMA, gaussian, huber
 from vislam.factors.preintegration import Preintegrator
-from vislam.factors.visual import direction_as_pose, pose_factor
+from vislam.factors.visual import direction_as_pose, measurement_of, pose_factor
 
 Factors = list[gtsam.NonlinearFactor]
+_UNSCALED_SIGMA = 0.1  # relative, on the steps of the run's own odometry with one camera, among its loops
 
 
 class Chain:
@@ -47,15 +43,14 @@ class Chain:
         self._lever_m = log.rig.T_body_cam0[:3, 3]
         self.has_imu = log.first_state is not None and log.noise is not None
         first = log.first_state if self.has_imu else None
-        self.start = start_record(first, _rigid(log.keyframes[0].T_map_body, "keyframe 0"))
+        self.start = start_record(first, log.keyframes[0].T_map_body)
         self._preintegrator = None
         if self.has_imu and log.noise is not None:
             self._preintegrator = Preintegrator(config, log.noise, self._machine)
-        self.records: list[KeyframeRecord] = []
-        for keyframe in log.keyframes:
-            self.records.append(keyframe_record(keyframe.packet, self.records[-1] if self.records else None))
-        self.poses = np.array([_rigid(k.T_map_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
-        odom = np.array([_rigid(k.T_odom_body, f"keyframe {i}") for i, k in enumerate(log.keyframes)])
+        self.records = keyframe_records([keyframe.packet for keyframe in log.keyframes])
+        whats = [f"the factor log's keyframe {i}" for i in range(len(log.keyframes))]
+        self.poses = checked_poses([k.T_map_body for k in log.keyframes], whats)
+        odom = checked_poses([k.T_odom_body for k in log.keyframes], whats)
         self._odometry = np.array([invert(a) @ b for a, b in pairwise(odom)]).reshape(-1, 4, 4)
         if not self.has_imu and any(not r.has_scale for r in self.records[1:]):
             raise DataError("the run is of one camera without an IMU: nothing in it shows scale")
@@ -92,7 +87,7 @@ class Chain:
             k, duration_s = record.id, _duration_s(before, record)
             has_imu = self.has_imu and self._inertial(factors, record, before, values, duration_s)
             if record.begins_submap:
-                factors.append(self._weak_link(record))
+                factors.append(self._weak_link(record, robust=True))
             elif seen[k] < min_seen:
                 tied.append(k)
                 factors += self._odometry_factors(record, values, duration_s, has_imu)
@@ -102,22 +97,21 @@ class Chain:
                     factors.append(motion.zero_velocity(k, self._machine.rest_speed_sigma_m_s))
         return factors, tied
 
-    def odometry_edges(self, scale_sigma: float) -> list[gtsam.BetweenFactorPose3]:
-        """Return the run's odometry as metric edges; `scale_sigma` is the relative one where vision had no scale."""
-        edges = []
-        for record in self.records[1:]:
-            duration_s = _duration_s(self.records[record.id - 1], record)
-            T = self._odometry[record.id - 1]
-            if record.begins_submap:
-                edges.append(self._weak_link(record))
-                continue
-            if record.T_previous_body is None or record.covariance is None:
-                edges.append(motion.loose_motion(record.id, T, *self._loose(duration_s)))
-                continue
-            T, covariance = self._metric(record, T, scale_sigma)
-            model = gaussian(covariance, self._config.covariance_ratio_max)
-            edges.append(pose_factor(X(record.id - 1), X(record.id), T, model))
-        return edges
+    def odometry(self) -> RelativePoses:
+        """Return the run's own odometry from keyframe to keyframe, metric also where vision had no scale."""
+        factors = [self._odometry_edge(before, record) for before, record in pairwise(self.records)]
+        return RelativePoses.of([(r.id - 1, r.id) for r in self.records[1:]], [measurement_of(f) for f in factors])
+
+    def _odometry_edge(self, before: KeyframeRecord, record: KeyframeRecord) -> gtsam.BetweenFactorPose3:
+        """Return what the run's own odometry states of the motion to a keyframe."""
+        if record.begins_submap:
+            return self._weak_link(record, robust=False)
+        T = self._odometry[record.id - 1]
+        if record.T_previous_body is None or record.covariance is None:
+            return motion.loose_motion(record.id, T, *self._loose(_duration_s(before, record)))
+        T, covariance = self._metric(record, T, _UNSCALED_SIGMA)
+        model = gaussian(covariance, self._config.covariance_ratio_max)
+        return pose_factor(X(record.id - 1), X(record.id), T, model)
 
     def _inertial(
         self, factors: Factors, record: KeyframeRecord, before: KeyframeRecord, values: gtsam.Values, duration_s: float
@@ -154,23 +148,21 @@ class Chain:
         """Return measured odometry as a metric motion with covariance; without scale `T_expected` lends its length."""
         assert record.T_previous_body is not None
         assert record.covariance is not None
-        config, T = self._config, record.T_previous_body
-        covariance = of_vision(record, config)
+        T, covariance = record.T_previous_body, of_vision(record, self._config)
         if record.has_scale:
             return T, covariance
-        lever = self._lever_m
-        step_m = float(np.linalg.norm(T_expected[:3, 3] + T_expected[:3, :3] @ lever - lever))
-        return direction_as_pose(
-            T, covariance, lever, max(step_m, DIRECTION_SOFT_M),
-            floor_rad=np.deg2rad(DIRECTION_FLOOR_DEG), scale_sigma=scale_sigma,
-        )  # fmt: skip
+        return direction_as_pose(T, covariance, self._lever_m, T_expected, scale_sigma)
 
-    def _weak_link(self, record: KeyframeRecord) -> gtsam.BetweenFactorPose3:
-        """Return what keeps a submap near where habit or else the run had it, should no loop tie it."""
+    def _weak_link(self, record: KeyframeRecord, robust: bool) -> gtsam.BetweenFactorPose3:
+        """Return what keeps a submap near where habit or else the run had it, should no loop tie it.
+
+        `robust`: where habit has it, under Huber's kernel.
+        """
         config, k = self._config, record.id
         if record.is_tied and record.T_previous_body is not None and record.covariance is not None:
-            model = gaussian(record.covariance, config.covariance_ratio_max)
-            return pose_factor(X(k - 1), X(k), record.T_previous_body, huber(model, config.huber_k))
+            model: gtsam.noiseModel.Base = gaussian(record.covariance, config.covariance_ratio_max)
+            model = huber(model, config.huber_k) if robust else model
+            return pose_factor(X(k - 1), X(k), record.T_previous_body, model)
         T = nearest_rigid(invert(self.poses[k - 1]) @ self.poses[k])
         return motion.loose_motion(k, T, np.deg2rad(SUBMAP_SIGMA_DEG), config.submap_sigma_m)
 
@@ -193,10 +185,3 @@ def _duration_s(before: KeyframeRecord, record: KeyframeRecord) -> float:
     """Return the seconds between two keyframes; before a new submap, whose clock may begin again, at least one."""
     duration_s = (record.t_ns - before.t_ns) * 1e-9
     return max(duration_s, 1.0) if record.begins_submap else duration_s
-
-
-def _rigid(T: Array, what: str) -> Array:
-    """Return a pose of the log made exactly rigid; raises DataError on damage."""
-    if not np.isfinite(T).all() or not are_rotations(T[:3, :3], 1e-3):
-        raise DataError(f"{what}: the pose in the factor log is not a rigid motion; run the recording again")
-    return nearest_rigid(T)

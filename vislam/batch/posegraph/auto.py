@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vislam.batch.posegraph.gnc import reject_false_edges, trusted_edges
-from vislam.batch.posegraph.judge import PLACE, Judge, Judgement, extent
+from vislam.batch.posegraph.judge import Judge, Judgement
 from vislam.batch.posegraph.problem import Decision, PoseGraphProblem
 from vislam.batch.posegraph.solver import Kernel, Progress, kernel_route, levenberg_marquardt
 from vislam.batch.posegraph.starts import chordal_start, odometry_start
@@ -28,6 +28,7 @@ from vislam.batch.posegraph.structure import Structure
 from vislam.config import PoseGraphConfig
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
+from vislam.factors.loop_evidence import APART, PLACE, SOUND, extent
 
 Mask = NDArray[np.bool_]
 
@@ -42,10 +43,8 @@ _NEARLY_ALL = 0.97  # of the loops kept, from which on nothing else is tried
 _OVERSTATED = 0.1  # of the stated variances: where loops show less, all are rescaled before judging
 _NUMBERS_MIN = 30  # redundant ones, to show it
 _SAME_PLACE = 0.02  # of the extent: solutions that differ by less, rms, are one
-_APART = 8.0  # log-likelihood between solutions that contradict each other, below which nothing is decided
 _GAIN_MIN = 6.0  # of the objective: what a solution must explain beyond odometry alone, if all others contradict it
 _ALONE = 0.5  # leverage from which on nothing else confirms a loop
-_THIN = 4.0  # log-odds of a cluster that stands alone, below which it is not believed
 _NAMED = 5  # clusters in a message
 
 
@@ -83,10 +82,11 @@ def _decide(
     judge = Judge(problem, trusted, odometry, config.inlier_probability)
     assert gnc.poses is not None
     plain = _plain(structure.problem, trusted, gnc.poses, config.inlier_probability)
-    alone, _ = judge.objective(odometry, trusted)
+    alone = judge.objective(odometry, trusted)
     found = _solutions(problem, judge, trusted, _routes(problem, trusted, odometry, plain, gnc), alone)
     loops = np.flatnonzero(~trusted)
-    (best_name, best), rivals = found[0], [e for e in found[1:] if e[1].is_likelier(alone)]
+    (best_name, best), others = found[0], [(name, j) for name, j in found[1:] if np.any(j.kept & ~trusted)]
+    rivals = [(name, j) for name, j in others if j.is_likelier(alone)]
     gain = alone - best.objective
     held, lost = best.kept & ~trusted, ~best.kept
     if not held.any() or not _is_enough(problem, judge, gain, held, lost):
@@ -102,7 +102,7 @@ def _decide(
     undecided = np.flatnonzero(disputed | thin)
     kept[undecided] = False
     if np.any(disputed | thin | tails):
-        _, poses = judge.objective(poses, kept)
+        poses = judge.optimum(poses, kept)
     reason = (
         f"{best_name}: {(kept & ~trusted).sum()} of {len(loops)} loops agree with odometry and each other"
         f" (log-likelihood {0.5 * gain:.4g} above odometry alone"
@@ -176,8 +176,7 @@ def _solutions(
     supposed true, unless what is likelier leaves none in doubt.
     """
     settled: list[tuple[str, Judgement]] = []
-    for name, end, kept in routes:
-        poses = _lowest(problem, end, kept)
+    for name, poses, kept in routes:
         believed = [j for _, j in settled if j.is_likelier(alone)]
         if any(_same(problem, poses, j.poses) for j in believed):
             break
@@ -188,9 +187,12 @@ def _solutions(
         nearly_all = found.strain <= 1.0 and found.kept[~trusted].mean() >= _NEARLY_ALL
         if nearly_all or any(_same(problem, found.poses, j.poses) for j in believed):
             break
-    return sorted(
-        settled, key=lambda e: (not e[1].is_likelier(alone), not np.any(e[1].kept & ~trusted), e[1].objective)
-    )
+
+    def rank(of: tuple[str, Judgement]) -> tuple[bool, bool, float]:
+        is_alone = not np.any(of[1].kept & ~trusted)  # what keeps no loop is likelier than odometry by rounding alone
+        return is_alone or not of[1].is_likelier(alone), is_alone, of[1].objective
+
+    return sorted(settled, key=rank)
 
 
 def _routes(
@@ -202,9 +204,10 @@ def _routes(
     scale = float(np.quantile(problem.edge_chi2(odometry)[~trusted], _QUANTILE))
     led_to = kernel_route(problem, trusted, odometry, "dcs", scale, True)
     if led_to is not None:
-        yield "dcs", led_to[0], trusted | (led_to[1] >= _IN)
+        kept = trusted | (led_to[1] >= _IN)
+        yield "dcs", _lowest(problem, led_to[0], kept), kept
     assert gnc.poses is not None
-    yield gnc.reason, gnc.poses, gnc.weights > 0.0
+    yield gnc.reason, _lowest(problem, gnc.poses, gnc.weights > 0.0), gnc.weights > 0.0
     yield "odometry", odometry, trusted
 
 
@@ -224,7 +227,7 @@ def _lowest(problem: PoseGraphProblem, poses: Array, kept: Mask) -> Array:
 def _same(problem: PoseGraphProblem, one: Array, other: Array) -> bool:
     d = problem.dimension
     apart = float(np.sqrt(np.mean(np.sum((one - other)[:, :d, d] ** 2, axis=1))))
-    return apart <= _SAME_PLACE * extent(problem, one)
+    return apart <= _SAME_PLACE * extent(one[:, :d, d])
 
 
 def _disputed(best: Judgement, rivals: list[Judgement]) -> Mask:
@@ -232,7 +235,7 @@ def _disputed(best: Judgement, rivals: list[Judgement]) -> Mask:
     out = np.zeros(len(best.kept), dtype=np.bool_)
     for rival in rivals:
         ours, theirs = best.kept & ~rival.kept, rival.kept & ~best.kept
-        if theirs.any() and 0.5 * (rival.objective - best.objective) < _APART:
+        if theirs.any() and 0.5 * (rival.objective - best.objective) < APART:
             out |= ours | theirs
     return out
 
@@ -244,7 +247,7 @@ def _thin(problem: PoseGraphProblem, best: Judgement, trusted: Mask) -> Mask:
     out = np.zeros(len(trusted), dtype=np.bool_)
     count = np.bincount(cluster)
     alone = np.bincount(cluster, best.leverage[at]) >= _ALONE * count
-    weak = np.bincount(cluster, best.evidence[at]) < _THIN
+    weak = np.bincount(cluster, best.evidence[at]) < SOUND
     out[at] = (alone & weak)[cluster]
     return out
 
@@ -252,7 +255,7 @@ def _thin(problem: PoseGraphProblem, best: Judgement, trusted: Mask) -> Mask:
 def _clusters(problem: PoseGraphProblem, at: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the cluster of each of the edges `at`: chains of loops whose ends are near each other in time."""
     ends = np.sort(problem.edges[at], axis=1)
-    pairs = cKDTree(ends).query_pairs(PLACE / 2, p=np.inf, output_type="ndarray") if len(at) else ends
+    pairs = cKDTree(ends).query_pairs(PLACE, p=np.inf, output_type="ndarray") if len(at) else ends
     joined = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(at), len(at)))
     return connected_components(joined, directed=False)[1].astype(np.int64)
 

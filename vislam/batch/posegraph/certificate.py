@@ -22,7 +22,7 @@ import numpy as np
 from vislam.batch.posegraph.isotropic import IsotropicGraph, Spectrum
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.solver import levenberg_marquardt
-from vislam.batch.posegraph.staircase import Climb, climb
+from vislam.batch.posegraph.staircase import Climb, climb, minimise, tangent
 from vislam.batch.posegraph.starts import harmonic_means
 from vislam.batch.posegraph.structure import Structure
 from vislam.batch.posegraph.symbolic import FACTOR_MAX_BYTES
@@ -78,17 +78,18 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
         return _unproven(chi2, f"{fixed} poses are fixed, two or more in one part; the proof is for free poses")
     of_cost = isotropic_weights(problem)
     graph = IsotropicGraph(problem, *of_cost)
-    if graph.factor_bytes > FACTOR_MAX_BYTES:
-        return _unproven(chi2, f"its factor takes {graph.factor_bytes / 1e9:.1f} GB, more than is allowed")
-    at = graph.minimise(poses)
+    needed = graph.bytes_of(tangent(problem.dimension, problem.dimension))
+    if needed > FACTOR_MAX_BYTES:
+        return _unproven(chi2, f"its factor takes {needed / 1e9:.1f} GB, more than is allowed")
+    at, _ = minimise(graph, poses[:, :-1])
     spectrum = graph.spectrum(at)
     if not np.isfinite(spectrum.proven):
         return _unproven(chi2, "measurements leave translations of a part of the graph without any information")
     climbed = None
     if spectrum.proven > _tolerance(graph, at, spectrum):
         climbed = climb(graph, at, problem.components(), _tolerance(graph, at, spectrum))
-        if graph.value(climbed.poses) < graph.value(at):
-            at = climbed.poses
+        if graph.value(climbed.X) < graph.value(at):
+            at = climbed.X
             spectrum = graph.spectrum(at)
     cost, tolerance = graph.value(at), _tolerance(graph, at, spectrum)
     least = spectrum.proven <= tolerance
@@ -123,9 +124,8 @@ def certify(problem: PoseGraphProblem, poses: Array, weights: Array | None = Non
     )
 
 
-def _tolerance(graph: IsotropicGraph, poses: Array, spectrum: Spectrum) -> float:
-    size = (poses.shape[1] - 1) * len(poses)
-    return max(_GAP * graph.value(poses) / size, 10.0 * spectrum.rounding)
+def _tolerance(graph: IsotropicGraph, X: Array, spectrum: Spectrum) -> float:
+    return max(_GAP * graph.value(X) / (X.shape[1] * len(X)), 10.0 * spectrum.rounding)
 
 
 def _left_open(climbed: Climb, cost: float) -> str:
@@ -174,17 +174,18 @@ def bounding_weights(problem: PoseGraphProblem) -> tuple[Array, Array]:
 
 def _bound(problem: PoseGraphProblem, poses: Array, kappa: Array, tau: Array) -> float:
     graph = IsotropicGraph(problem, kappa, tau)
-    at = graph.minimise(poses)
+    at, _ = minimise(graph, poses[:, :-1])
     proven = graph.spectrum(at).proven
     return max(graph.value(at) - problem.dimension * len(poses) * proven, 0.0)
 
 
-def _descended(problem: PoseGraphProblem, start: Array, poses: Array) -> Array:
-    """Return the minimum of chi2 that `start` leads to, the anchor of each part where `poses` have it.
+def _descended(problem: PoseGraphProblem, X: Array, poses: Array) -> Array:
+    """Return the minimum of chi2 that [R t], X [N, d, d + 1], lead to, the anchor of each part where `poses` have it.
 
     Where both have the same residuals, but for what is nothing beside their chi2, it leads to `poses`.
     """
-    ones, anchors = np.ones(len(problem.edges)), problem.anchors()
+    ones, anchors, start = np.ones(len(problem.edges)), problem.anchors(), np.zeros_like(poses)
+    start[:, :-1], start[:, -1, -1] = X, 1.0
     labels = problem.components()
     held = np.empty(len(anchors), dtype=np.int64)
     held[labels[anchors]] = anchors

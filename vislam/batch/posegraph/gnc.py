@@ -20,10 +20,10 @@ from vislam.batch.posegraph.starts import odometry_start
 from vislam.batch.posegraph.structure import Structure
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.messages import Array
+from vislam.factors.loop_evidence import SOUND, entering, innovation, log_volume
 
 Mask = NDArray[np.bool_]
 
-_EVIDENCE = (16.0, 12.0, 9.0, 6.0, 4.0)  # log-odds of a loop that enters; lower ones once there is nothing above
 _ROUNDS_MAX = 60
 _CLOSEST = 0.1  # of the loops, taken as the closest fifth of true ones when half of all are false
 _LOOPS_FOR_SCALE = 30  # from which on the cost per degree of freedom shows the scale
@@ -89,7 +89,7 @@ def _gated(
     kept = trusted.copy()
     chain = problem.with_edges(trusted)
     poses = odometry_start(chain, chain.anchors())
-    volume = _log_volume(problem, poses)
+    volume = log_volume(poses[:, :-1, -1])
     level, scale = 0, 0.0
     for _ in range(_ROUNDS_MAX):
         structure = Structure(problem.with_edges(kept))
@@ -109,24 +109,12 @@ def _gated(
             scale = float(np.quantile(distance, _CLOSEST) / chi_square_limit(2.0 * _CLOSEST, k))
         scale = min(1.0, max(scale, _SCALE_MIN))
         evidence = volume + log_density - 0.5 * (k * math.log(scale) + distance / scale)
-        passed = distance <= limit * scale
-        enters = rest[passed & (evidence >= _EVIDENCE[level])]
-        while not len(enters) and level + 1 < len(_EVIDENCE):
-            level += 1
-            enters = rest[passed & (evidence >= _EVIDENCE[level])]
-        if not len(enters):
+        enters, level = entering(np.where(distance <= limit * scale, evidence, -np.inf), level, SOUND)
+        if not enters.any():
             kept[rest[distance <= _NEAR * limit * scale]] = True
             break
-        kept[enters] = True
+        kept[rest[enters]] = True
     return poses, kept, scale or 1.0
-
-
-def _log_volume(problem: PoseGraphProblem, poses: Array) -> float:
-    """Return the logarithm of the space in which a false loop may put a pose: angles, and the trajectory's box."""
-    d = problem.dimension
-    extent = np.maximum(np.ptp(poses[:, :d, d], axis=0), 1.0)
-    angles = 2.0 * math.pi if d == 2 else 8.0 * math.pi**2
-    return float(np.sum(np.log(extent))) + math.log(angles)
 
 
 def _tested(
@@ -137,10 +125,8 @@ def _tested(
     S, _ = covariances_of_edges(structure, problem, poses, ones, edges, np.zeros(len(edges), dtype=np.bool_))
     information = problem.information[edges]
     floor = _LEAST_INFORMATION * np.einsum("eii->e", information)
-    innovation = S + np.linalg.inv(information + floor[:, None, None] * np.eye(k))
-    r = problem.residuals(poses)[edges]
-    distance = np.einsum("ea,ea->e", r, np.linalg.solve(innovation, r[:, :, None])[:, :, 0])
-    return distance, -0.5 * (np.linalg.slogdet(innovation)[1] + k * math.log(2.0 * math.pi))
+    noise = np.linalg.inv(information + floor[:, None, None] * np.eye(k))
+    return innovation(problem.residuals(poses)[edges], S + noise)
 
 
 def graduated_non_convexity(

@@ -1,4 +1,4 @@
-"""SE-Sync's cost of a pose graph, its minimum near a start, and the eigenvalue that proves it to be the global one.
+"""SE-Sync's cost of a pose graph, its derivatives, and the eigenvalue that proves a minimum to be the global one.
 
 With X_i = [R_i t_i] and a measurement Z, the cost is f(X) = sum over edges of |(X_j - X_i Z) D^(1/2)|^2_F, where D is
 kappa for the columns of the rotation and tau for the translation: a quadratic form tr(X M X^T) of the poses' matrices.
@@ -13,22 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 
-from vislam.batch.posegraph.arithmetic import retract_2d, retract_3d
 from vislam.batch.posegraph.cholesky import Factor
 from vislam.batch.posegraph.problem import PoseGraphProblem
 from vislam.batch.posegraph.symbolic import analyse
-from vislam.core.jit import njit
 from vislam.core.messages import Array
 
-_STEPS = 100  # from a minimum of chi2 three to six are enough
-_CONVERGED = 1e-14  # of the cost: what a step still promises; further ones drown in rounding
-_NEAR = 1e-8  # of the cost: where a step promises less, the factor of the step before serves the next ones
-_DAMPING = 1e-4  # of the diagonal, where the plain step fails
-_MAX_DAMPING = 1e8
 _ROUNDING = 1e-13  # of the largest entry: below, a pivot of the factorisation may be negative by rounding alone
 _LANCZOS_TOLERANCE = 1e-6
 _SPECTRUM = 2  # eigenvalues beyond those that are zero at a minimum
@@ -63,63 +55,12 @@ class IsotropicGraph:
         self._off = -ZD
         self._symbolic = analyse(n, *np.ascontiguousarray(self._edges.T))
         _, self._pinned = np.unique(problem.components(), return_index=True)  # one pose of each part
-        self._motions = _motions(d)
-        self._free = np.arange(n)
 
-    @property
-    def factor_bytes(self) -> int:
-        """Memory that the largest of its factors takes."""
-        return self.bytes_of(len(self._motions))
-
-    def value(self, poses: Array) -> float:
-        """Return the cost of poses [N, d + 1, d + 1]."""
-        return self.lifted_value(poses[:, : self._d])
-
-    def lifted_value(self, X: Array) -> float:
+    def value(self, X: Array) -> float:
         """Return the cost of X [N, r, d + 1], the matrices [R t] of poses in r >= d dimensions."""
         return float(np.einsum("eab,eab,eb->", E := self._residuals(X), E, self._D))
 
-    def gradient(self, poses: Array) -> float:
-        """Return the norm of the gradient of half the cost at poses: near 0 at a minimum."""
-        return float(np.linalg.norm(self._along_motions(poses, self.force(poses[:, : self._d]))))
-
-    def minimise(self, poses: Array) -> Array:
-        """Return the poses at the local minimum that Newton's method reaches from these."""
-        poses, cost, damping, promised = poses.copy(), self.value(poses), 0.0, np.inf
-        factor = Factor(self._symbolic, len(self._motions))
-        for _ in range(_STEPS):
-            force = self.force(poses[:, : self._d])
-            gradient = self._along_motions(poses, force)
-            if damping > 0.0 or promised > _NEAR * cost:
-                blocks = self._projected(poses, self._certificate(poses[:, : self._d], force))
-                if damping > 0.0 or not factor.factorise(*blocks):  # Newton's matrix is indefinite far from a minimum
-                    blocks = self._projected(poses, self._diagonal)
-                    damping = max(damping, _DAMPING)
-            promised, better, better_cost = 0.0, poses, np.inf
-            while True:
-                if damping == 0.0 or factor.factorise(_damped(blocks[0], damping), blocks[1]):
-                    step = factor.solve(-gradient)
-                    promised = -float(np.vdot(gradient, step))
-                    better = self._moved(poses, step)
-                    better_cost = self.value(better)
-                    if better_cost <= cost or promised < _CONVERGED * cost:
-                        break
-                damping = max(10.0 * damping, _DAMPING)
-                if damping > _MAX_DAMPING:
-                    return poses
-            if better_cost > cost:
-                return poses
-            poses, cost = better, better_cost
-            damping = 0.1 * damping if damping > _DAMPING else 0.0
-            if promised < _CONVERGED * cost:
-                return poses
-        return poses
-
-    def spectrum(self, poses: Array) -> Spectrum:
-        """Return the low end of the spectrum of the certificate matrix at poses."""
-        return self.lifted_spectrum(poses[:, : self._d])
-
-    def lifted_spectrum(self, X: Array) -> Spectrum:
+    def spectrum(self, X: Array) -> Spectrum:
         """Return the low end of the spectrum of the certificate matrix at X [N, r, d + 1]."""
         d, n = self._d, len(X)
         S = self._certificate(X, self.force(X))
@@ -201,88 +142,13 @@ class IsotropicGraph:
         S[:, : self._d, : self._d] -= self._multipliers(X, force)
         return S
 
-    def _along_motions(self, poses: Array, force: Array) -> Array:
-        """Return the gradient [N, k] of half the cost by body-side tangents."""
-        turned = poses[:, : self._d, : self._d].transpose(0, 2, 1) @ force
-        return np.einsum("nab,kab->nk", turned, self._motions)
-
-    def _projected(self, poses: Array, diagonal: Array) -> tuple[Array, Array]:
-        """Return the blocks of a form M - diag(...) on body-side tangents, one pose of each part held."""
-        n, k = len(poses), len(self._motions)
-        own, off = np.empty((n, k, k)), np.empty((len(self._edges), k, k))
-        rotations = np.ascontiguousarray(poses[:, : self._d, : self._d])
-        same = np.column_stack([self._free, self._free])
-        _project(same, rotations, diagonal, self._motions, own)
-        _project(self._edges, rotations, self._off, self._motions, off)
-        own[self._pinned] *= 2.0  # as in `spectrum`: the cost does not see a motion of the whole part
-        return own, self._placed(off)
-
     def _placed(self, off: Array) -> Array:
         """Return blocks (from, to) as `Factor` takes them."""
         swapped = np.where(self._symbolic.later_is_to[:, None, None], off, off.transpose(0, 2, 1))
         return np.ascontiguousarray(swapped)
-
-    def _moved(self, poses: Array, step: Array) -> Array:
-        out = poses.copy()
-        (retract_2d if self._d == 2 else retract_3d)(poses, self._free, step, out)
-        return out
-
-
-def _motions(d: int) -> Array:
-    """Return the derivatives [k, d, d + 1] of [R t] = [I 0] by a body-side tangent: rotations, then translations."""
-    count = d * (d - 1) // 2
-    out = np.zeros((count + d, d, d + 1))
-    for k, (a, b) in enumerate([(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)]):
-        out[k, a, b], out[k, b, a] = -1.0, 1.0
-    for a in range(d):
-        out[count + a, a, d] = 1.0
-    return out
-
-
-def _damped(diagonal: Array, damping: float) -> Array:
-    out = diagonal.copy()
-    k = range(diagonal.shape[1])
-    out[:, k, k] *= 1.0 + damping
-    return out
 
 
 def _shifted(S: Array, eta: float, d: int) -> Array:
     out = S.copy()
     out[:, range(d), range(d)] += eta
     return out
-
-
-@njit(cache=True, nogil=True)
-def _project(  # noqa: PLR0912
-    pairs: NDArray[np.int64], R: Array, blocks: Array, motions: Array, out: Array
-) -> None:
-    """Write <R_i C_k B, R_j C_l> for pairs (i, j) with blocks B [M, d + 1, d + 1] and motions C into out [M, k, k]."""
-    count, d = len(motions), R.shape[1]
-    N, A, turned = np.empty((d, d)), np.empty((d, d + 1)), np.empty((d, d + 1))
-    for e in range(len(pairs)):
-        Ri, Rj, B = R[pairs[e, 0]], R[pairs[e, 1]], blocks[e]
-        for a in range(d):
-            for b in range(d):
-                s = 0.0
-                for c in range(d):
-                    s += Rj[c, a] * Ri[c, b]
-                N[a, b] = s
-        for k in range(count):
-            for a in range(d):
-                for b in range(d + 1):
-                    s = 0.0
-                    for c in range(d + 1):
-                        s += motions[k, a, c] * B[c, b]
-                    A[a, b] = s
-            for a in range(d):
-                for b in range(d + 1):
-                    s = 0.0
-                    for c in range(d):
-                        s += N[a, c] * A[c, b]
-                    turned[a, b] = s
-            for q in range(count):
-                s = 0.0
-                for a in range(d):
-                    for b in range(d + 1):
-                        s += turned[a, b] * motions[q, a, b]
-                out[e, k, q] = s

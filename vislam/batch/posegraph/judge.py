@@ -25,10 +25,10 @@ from vislam.batch.posegraph.solver import levenberg_marquardt
 from vislam.batch.posegraph.structure import Structure
 from vislam.core.chi_square import chi_square_limits
 from vislam.core.messages import Array
+from vislam.factors.loop_evidence import PLACE, SOUND, entering, extent, spread
 
 Mask = NDArray[np.bool_]
 
-_LEVELS = (16.0, 12.0, 8.0, 4.0, 2.0, 0.0)  # log-odds of a loop that enters; lower ones once there is nothing above
 _ROUNDS_MAX = 40
 _KNOWN = 10.0  # information times the square of the space's spread: below, a direction is not known
 _TAILS = 4.0  # times the chi-square limit: errors of real loops have heavier tails than a Gaussian
@@ -37,7 +37,6 @@ _ODDS = math.log(3.0)  # a loop is believed that is three times likelier true th
 _SUPPOSED_MAX = 6  # loops, one at a time, that are supposed true, the likeliest first, ...
 _HARDLY = -3.0  # ... down to these log-odds
 _CLEARLY = 16.0  # of the objective: what shows that one is true
-_SOUND = 4.0  # log-odds of a kept loop below which it may have to go before others can come
 _BACK = 2.0  # log-odds more for every time that it was taken back
 _BORDER = 1.0  # log-odds: covariances of loops nearer to a decision are computed in every round
 _CHANGED = 0.05  # of the loops kept: as many changes, and those of all are
@@ -52,8 +51,6 @@ _JUDGED_MIN = 5  # loops, to show theirs
 _LEVERAGE_MAX = 1.0 - 1e-9
 _ITERATIONS, _TOLERANCE = 10, 1e-5
 _PLACE_WAY = 0.05  # of the extent: as far along the way a place reaches
-
-PLACE = 20  # successive poses that make one place, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,18 +84,18 @@ class Judge:
         """Take the extent of `poses` [N, d + 1, d + 1] as the space in which a false loop may put a pose."""
         self._problem, self._trusted = problem, trusted
         self._loops = np.flatnonzero(~trusted)
-        self._space_m = extent(problem, poses)
+        self._space_m, self._spread = extent(poses[:, :-1, -1]), spread(poses[:, :-1, -1])
         self._at = _along(problem, poses, _PLACE_WAY * self._space_m)
-        d, k = problem.dimension, problem.tangent
-        spread = np.full(k, self._space_m / math.sqrt(2.0 * math.pi))  # a Gaussian with a box's density at its peak
-        spread[: k - d] = (2.0 * math.pi if d == 2 else (8.0 * math.pi**2) ** (1.0 / 3.0)) / math.sqrt(2.0 * math.pi)
-        self._spread = spread
-        values, self._axes = np.linalg.eigh(problem.information * np.outer(spread, spread))
+        values, self._axes = np.linalg.eigh(problem.information * np.outer(self._spread, self._spread))
         self._known = values > _KNOWN
         self._values = np.where(self._known, values, 1.0)
         self._dof = self._known.sum(axis=1)
         self._limit = _TAILS * chi_square_limits(probability, np.maximum(self._dof, 1))
         self._medians = chi_square_limits(0.5, np.maximum(self._dof, 1))
+        self._tree = cKDTree(self._ends(self._loops)) if len(self._loops) else None
+        # how many of the loops kept join the same two places as each loop, itself among them, and which these are
+        self._alike, self._counted = np.zeros(len(self._loops)), np.zeros(len(self._loops), dtype=np.bool_)
+        self._newest: tuple[Mask, Structure, Array] | None = None  # of the edges kept that were asked for last
 
     def supposing(self, found: Judgement) -> Judgement:
         """Return what a settled solution grows to where loops are supposed true that nothing decides about.
@@ -109,8 +106,8 @@ class Judge:
         first, best = found, None
         while best is not found:
             best, core = found, found
-            if best.evidence[best.kept].min() < _SOUND:
-                core = self.settle(best.poses, best.kept & (best.evidence >= _SOUND), 0)
+            if best.evidence[best.kept].min() < SOUND:  # it may have to go before others can come
+                core = self.settle(best.poses, best.kept & (best.evidence >= SOUND), 0)
             evidence = np.where(best.kept, -np.inf, core.evidence)
             for e in np.argsort(-evidence, kind="stable")[:_SUPPOSED_MAX].tolist():
                 if evidence[e] < _HARDLY or best.objective - found.objective > _CLEARLY:
@@ -128,21 +125,22 @@ class Judge:
         After no rounds that is the edges kept, judged.
         """
         scales, level, changed, at = (1.0, 1.0), 0, 0, self._loops
-        S, judged_with = np.zeros((len(at), len(self._spread), len(self._spread))), scales
+        values, judged_with = np.zeros((len(at), len(self._spread))), scales
+        axes = np.zeros((*values.shape, len(self._spread)))
         stale, score, share = np.ones(len(at), dtype=np.bool_), np.zeros(len(at)), np.zeros(len(at))
         times_out = np.zeros(len(at))
         for left in range(rounds, -1, -1):
-            structure, poses, scales = self._calibrated(poses, kept, scales)
+            poses, scales = self._calibrated(poses, kept, scales)
             if _apart(scales, judged_with) > _SETTLED or changed > _CHANGED * kept[at].sum():
                 stale[:], changed, judged_with = True, 0, scales
-            weights = (self._counts_for(kept) / self._variances(scales))[kept]
-            S[stale], _ = covariances_of_edges(structure, self._problem, poses, weights, at[stale], kept[at[stale]])
-            score, share = self._scores(poses, kept, scales, S)
+            S = self._covariances(poses, kept, scales, at[stale])
+            values[stale], axes[stale] = np.linalg.eigh(self._in_sigmas(S, np.ones(len(kept)), at[stale]))
+            score, share = self._scores(poses, kept, scales, values, axes)
             inside, was_fresh = kept[at], stale.all()
             leaves = _leaving(inside, score)
             enters = np.zeros(len(at), dtype=np.bool_)
             if leaves.sum() <= max(1, 0.01 * inside.sum()):
-                enters, level = _entering(inside, score - _BACK * times_out, level)
+                enters, level = entering(np.where(inside, -np.inf, score - _BACK * times_out), level)
             if left == 0 or not np.any(leaves | enters):
                 if left == 0 or was_fresh or changed == 0:
                     break
@@ -153,17 +151,21 @@ class Judge:
             kept[at[leaves]], kept[at[enters]] = False, True
             changed += int(np.sum(leaves | enters))
             stale = leaves | enters | (np.abs(score) < _BORDER)
-        _, poses, scales = self._calibrated(poses, kept, scales)
+        poses, scales = self._calibrated(poses, kept, scales)
         evidence, leverage = np.full(len(kept), np.inf), np.zeros(len(kept))
         evidence[at], leverage[at] = score + _ODDS, np.where(kept[at], share, 0.0)
         trusted = np.flatnonzero(self._trusted)
         strain = float(np.sum(self._errors(poses, self._variances(scales), trusted) ** 2) / self._dof[trusted].sum())
         return Judgement(poses, kept, *scales, self._likelihood(poses, kept, scales), evidence, leverage, strain)
 
-    def objective(self, poses: Array, kept: Mask) -> tuple[float, Array]:
-        """Return the objective (see `Judgement`) of edges kept [E] and their optimum near poses."""
-        _, poses, scales = self._calibrated(poses, kept, (1.0, 1.0))
-        return self._likelihood(poses, kept, scales), poses
+    def objective(self, poses: Array, kept: Mask) -> float:
+        """Return the objective (see `Judgement`) of edges kept [E] at their optimum near poses."""
+        poses, scales = self._calibrated(poses, kept, (1.0, 1.0))
+        return self._likelihood(poses, kept, scales)
+
+    def optimum(self, poses: Array, kept: Mask) -> Array:
+        """Return the optimum of edges kept [E] near poses."""
+        return self._calibrated(poses, kept, (1.0, 1.0))[0]
 
     def witnesses(self, edges: Mask) -> int:
         """Return how many loops among edges [E] are witnesses independent of each other: one per pair of places."""
@@ -174,36 +176,58 @@ class Judge:
 
     def _counts_for(self, kept: Mask) -> Array:
         """Return what share of itself each edge [E] counts for: kept loops between the same two places make one."""
-        out = np.ones(len(kept))
-        at = self._loops[kept[self._loops]]
-        out[at] = 1.0 / self._alike(at)
-        return out
+        return self._of(kept)[1]
 
-    def _alike(self, loops: NDArray[np.int64]) -> Array:
-        """Return how many of the loops [M] (indices of edges) join the same two places as each, itself among them."""
-        if not len(loops):
-            return np.ones(0)
-        ends = self._ends(loops)
-        return np.asarray(cKDTree(ends).query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
+    def _of(self, kept: Mask) -> tuple[Structure, Array]:
+        """Return the structure of the edges kept [E], and for what share of itself each edge counts."""
+        if self._newest is None or self._newest[0] is not kept:
+            self._count(kept[self._loops])
+            counts_for = np.ones(len(kept))
+            counts_for[self._loops] = 1.0 / np.maximum(self._alike, 1)
+            self._newest = kept, Structure(self._problem.with_edges(kept)), counts_for
+        return self._newest[1:]
 
-    def _calibrated(
-        self, poses: Array, kept: Mask, scales: tuple[float, float]
-    ) -> tuple[Structure, Array, tuple[float, float]]:
-        """Return the optimum of the edges kept, with variances scaled by what their residuals show."""
+    def _weights(self, kept: Mask, scales: tuple[float, float]) -> Array:
+        """Return the weights of the edges kept."""
+        return (self._counts_for(kept) / self._variances(scales))[kept]
+
+    def _optimum(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> Array:
+        """Return the poses near these that the edges kept lead to."""
+        structure, weights = self._of(kept)[0], self._weights(kept, scales)
+        return levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
+
+    def _covariances(self, poses: Array, kept: Mask, scales: tuple[float, float], at: NDArray[np.int64]) -> Array:
+        """Return the covariances [M, k, k] of edges `at` at the optimum of those kept, see `covariances_of_edges`."""
+        structure, weights = self._of(kept)[0], self._weights(kept, scales)
+        return covariances_of_edges(structure, self._problem, poses, weights, at, kept[at])[0]
+
+    def _count(self, kept: Mask) -> None:
+        """Count again, for the loops kept [L], those alike; of few that changed, around these alone."""
+        changed = np.flatnonzero(kept != self._counted)
+        if self._tree is None or not len(changed):
+            return
+        ends, self._counted = np.asarray(self._tree.data), kept
+        if len(changed) > _CHANGED * len(kept):
+            held = cKDTree(ends[kept]) if kept.any() else None
+            self._alike = np.zeros(len(kept)) if held is None else _counted_within(held, ends)
+            return
+        for loop, near in zip(changed, self._tree.query_ball_point(ends[changed], 1.0, p=np.inf), strict=True):
+            self._alike[near] += 1.0 if kept[loop] else -1.0
+
+    def _calibrated(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> tuple[Array, tuple[float, float]]:
+        """Return the optimum of the edges kept, with variances scaled by what residuals of a sample of them show."""
         edges = np.flatnonzero(kept)
-        structure, trusted = Structure(self._problem.with_edges(edges)), self._trusted[edges]
+        trusted, counts_for = self._trusted[edges], self._counts_for(kept)
         sample = np.concatenate([spread_out(edges[trusted], _SAMPLE), spread_out(edges[~trusted], _SAMPLE)])
-        counts_for = self._counts_for(kept)
         for _ in range(_CALIBRATIONS):
+            poses = self._optimum(poses, kept, scales)
+            S = self._covariances(poses, kept, scales, sample)
             variances = self._variances(scales)
-            weights = (counts_for / variances)[edges]
-            poses = levenberg_marquardt(structure, poses, weights, iterations=_ITERATIONS, tolerance=_TOLERANCE).poses
-            S, _ = covariances_of_edges(structure, self._problem, poses, weights, sample, kept[sample])
-            z, L = self._whitened(poses, S, variances, sample)
+            z, L = self._errors(poses, variances, sample), self._in_sigmas(S, variances, sample)
             before, scales = scales, self._scales(z, L, counts_for[sample], sample, scales)
             if _apart(scales, before) < _SETTLED:
                 break
-        return structure, poses, scales
+        return poses, scales
 
     def _likelihood(self, poses: Array, kept: Mask, scales: tuple[float, float]) -> float:
         """Return the objective (see `Judgement`), near poses, of odometry and one kept loop of each two places."""
@@ -245,66 +269,70 @@ class Judge:
             odometry *= float(np.sum(z[trusted] ** 2)) / float(free[trusted].sum())
         judged = ~trusted & (free >= 0.5 * dof)
         if judged.sum() > _JUDGED_MIN:
-            studentised = _studentised(z[judged], L[judged], counts_for[judged])[0]
+            studentised = _studentised(z[judged], *np.linalg.eigh(L[judged]), counts_for[judged])[0]
             loops *= float(np.median(studentised / self._medians[edges][judged]))
         return (
             min(max(odometry, _SCALE_MIN), _ODOMETRY_SCALE_MAX),
             min(max(loops, _LOOPS_BETTER * min(odometry, 1.0), _SCALE_MIN), _LOOP_SCALE_MAX),
         )
 
-    def _scores(self, poses: Array, kept: Mask, scales: tuple[float, float], S: Array) -> tuple[Array, Array]:
-        """Return log-odds of all loops above those asked for, and leverages, given covariances S [L, k, k]."""
-        at, variances = self._loops, self._variances(scales)
-        z, L = self._whitened(poses, S, variances, at)
+    def _scores(
+        self, poses: Array, kept: Mask, scales: tuple[float, float], values: Array, axes: Array
+    ) -> tuple[Array, Array]:
+        """Return log-odds of all loops above those asked for, and leverages.
+
+        values [L, k] and axes [L, k, k] are the eigenvalues and eigenvectors of the loops' covariances by the solution,
+        in the standard deviations that they state.
+        """
+        at, variances, values = self._loops, self._variances(scales), values / scales[1]
         taken = np.where(kept, self._counts_for(kept), 0.0)[at]
-        distance, spread = _studentised(z, L, taken)
+        distance, spread = _studentised(self._errors(poses, variances, at), values, axes, taken)
         stated = np.log(self._values[at]).sum(axis=1) - self._dof[at] * np.log(variances[at])
         # the space as it is now: that of odometry may be many times too large
-        smaller = math.log(extent(self._problem, poses) / self._space_m)
+        smaller = math.log(extent(poses[:, :-1, -1]) / self._space_m)
         share = self._share(kept)
         evidence = 0.5 * (stated - spread - distance) + math.log(share / (1.0 - share))
         evidence += np.minimum(self._dof[at], self._problem.dimension) * min(smaller, 0.0)
-        leverage = taken * np.einsum("eaa->e", L) / np.maximum(self._dof[at], 1)
+        leverage = taken * values.sum(axis=1) / np.maximum(self._dof[at], 1)
         return np.minimum(evidence, 0.5 * (self._limit[at] - distance)) - _ODDS, leverage
 
     def _share(self, kept: Mask) -> float:
         count, held = len(self._loops), int(kept[self._loops].sum())
         return min(max((held + 1.0) / (count + 2.0), 0.02), 0.98)
 
-    def _whitened(self, poses: Array, S: Array, variances: Array, at: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return errors [M, k] in standard deviations along known axes, and S in the same units [M, k, k]."""
+    def _in_sigmas(self, S: Array, variances: Array, at: NDArray[np.int64]) -> Array:
+        """Return covariances S [M, k, k] in standard deviations of the edges `at` along known axes."""
         V = self._axes[at]
         root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
         inner = V.transpose(0, 2, 1) @ (S / np.outer(self._spread, self._spread)) @ V
-        return self._errors(poses, variances, at), inner * root[:, :, None] * root[:, None, :]
+        return np.asarray(inner * root[:, :, None] * root[:, None, :])
 
     def _errors(self, poses: Array, variances: Array, at: NDArray[np.int64]) -> Array:
+        """Return errors [M, k] of the edges `at` in their standard deviations along known axes."""
         r = self._problem.residuals(poses)[at] / self._spread
         root = np.sqrt(self._values[at] / variances[at][:, None]) * self._known[at]
         return np.einsum("eab,ea->eb", self._axes[at], r) * root
 
 
-def extent(problem: PoseGraphProblem, poses: Array) -> float:
-    """Return the geometric mean of the sides of the box around poses, none shorter than a tenth of the longest."""
-    d = problem.dimension
-    sides = np.ptp(poses[:, :d, d], axis=0)
-    return float(np.exp(np.mean(np.log(np.maximum(sides, max(0.1 * sides.max(initial=0.0), 1e-9))))))
+def _counted_within(tree: cKDTree, ends: Array) -> Array:
+    """Return how many points of a tree are at the same two places as each of the ends [M, 4]."""
+    return np.asarray(tree.query_ball_point(ends, 1.0, p=np.inf, return_length=True), dtype=np.float64)
 
 
 def _along(problem: PoseGraphProblem, poses: Array, place_m: float) -> Array:
     """Return where poses are in the sequence and along the way [N, 2], in places."""
     d = problem.dimension
     steps = np.linalg.norm(np.diff(poses[:, :d, d], axis=0, prepend=poses[:1, :d, d]), axis=1)
-    return np.column_stack([np.arange(len(poses)) / (PLACE / 2), np.cumsum(steps) / place_m])
+    return np.column_stack([np.arange(len(poses)) / PLACE, np.cumsum(steps) / place_m])
 
 
-def _studentised(z: Array, L: Array, taken: Array) -> tuple[Array, Array]:
+def _studentised(z: Array, values: Array, axes: Array, taken: Array) -> tuple[Array, Array]:
     """Return the squared length of innovations [M] in their standard deviations, and log det of their covariance.
 
-    z [M, k] are errors and L [M, k, k] covariances of the solution, in the loop's standard deviations; the solution has
-    taken the loop with the weight `taken` [M] (0: not at all), which is undone.
+    z [M, k] are errors, values [M, k] and axes [M, k, k] eigenvalues and eigenvectors of covariances of the solution,
+    in the loop's standard deviations; the solution has taken the loop with the weight `taken` [M] (0: not at all),
+    which is undone.
     """
-    values, axes = np.linalg.eigh(L)
     values = np.maximum(values, 0.0)
     without = np.maximum(1.0 - taken[:, None] * values, 1.0 - _LEVERAGE_MAX)
     variances = 1.0 + values / without
@@ -316,14 +344,6 @@ def _leaving(inside: Mask, score: Array) -> Mask:
     """Return the worst of the loops that are in and should not be."""
     bad = inside & (score < 0.0)
     return bad & (score <= _WORST * score[bad].min(initial=0.0))
-
-
-def _entering(inside: Mask, score: Array, level: int) -> tuple[Mask, int]:
-    """Return the loops of the highest level that has any to let in, and that level."""
-    score = np.where(inside, -np.inf, score)
-    while level + 1 < len(_LEVELS) and not np.any(score > _LEVELS[level]):
-        level += 1
-    return score > _LEVELS[level], level
 
 
 def _apart(scales: tuple[float, float], others: tuple[float, float]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -156,6 +157,42 @@ class PoseGraphProblem:
     def with_poses(self, poses: Array) -> PoseGraphProblem:
         """Return the problem with other poses to start from."""
         return replace(self, poses=np.ascontiguousarray(poses, dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePoses:
+    """Measurements in space between poses 0, 1, 2, ..., tangents as in `PoseGraphProblem`."""
+
+    ends: Ids  # [E, 2]
+    T_from_to: Array  # [E, 4, 4]
+    information: Array  # [E, 6, 6]
+
+    @staticmethod
+    def of(ends: Sequence[tuple[int, int]], measured: Sequence[tuple[Array, Array]]) -> RelativePoses:
+        """Return measurements [4, 4] with their information [6, 6] between these ends."""
+        return RelativePoses(
+            np.array(ends, dtype=np.int64).reshape(-1, 2),
+            np.array([T for T, _ in measured], dtype=np.float64).reshape(-1, 4, 4),
+            np.array([information for _, information in measured], dtype=np.float64).reshape(-1, 6, 6),
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
+        """Return measurements one after another."""
+        return RelativePoses(
+            np.concatenate([part.ends for part in parts]),
+            np.concatenate([part.T_from_to for part in parts]),
+            np.concatenate([part.information for part in parts]),
+        )
+
+    def problem(self, poses: Array) -> PoseGraphProblem:
+        """Return the pose graph of the measurements, with poses [N, 4, 4] to start from."""
+        count = len(poses)
+        return PoseGraphProblem(
+            3, np.arange(count), np.ascontiguousarray(poses), np.zeros(count, np.bool_),
+            np.ascontiguousarray(self.ends), np.ascontiguousarray(self.T_from_to),
+            np.ascontiguousarray(self.information),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

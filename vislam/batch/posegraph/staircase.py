@@ -23,6 +23,7 @@ from vislam.core.messages import Array
 _LEVELS = 7  # dimensions added at most: one or two where measurements make sense, five where they are random
 _STEPS = 200
 _CONVERGED = 1e-13  # of the cost: what a step still promises
+_NEAR = 1e-8  # of the cost: where a step promises less, the factor of the step before serves the next ones
 _LEAST_DAMPING, _MAX_DAMPING = 1e-10, 1e8  # the least one is for turns that the cost does not see
 _HALVINGS = 40  # of the step along an eigenvector
 
@@ -31,36 +32,35 @@ _HALVINGS = 40  # of the step along an eigenvector
 class Climb:
     """Where the staircase ended."""
 
-    poses: Array  # [N, d + 1, d + 1] at a minimum of the isotropic cost
+    X: Array  # [N, d, d + 1] at a minimum of the isotropic cost
     rank: int  # dimensions of the highest step
     solved: bool  # the relaxation has its minimum there
     bound: float  # no poses have a lower isotropic cost; 0 where nothing is known
     gradient: float  # of half the cost where the highest step ended
 
 
-def climb(graph: IsotropicGraph, poses: Array, labels: Ids, tolerance: float) -> Climb:
-    """Return what the staircase finds from poses [N, d + 1, d + 1] whose certificate matrix is not positive.
+def climb(graph: IsotropicGraph, X: Array, labels: Ids, tolerance: float) -> Climb:
+    """Return what the staircase finds from poses [R t], X [N, d, d + 1], whose certificate matrix is not positive.
 
     `labels` [N] numbers the connected parts. An eigenvalue down to minus `tolerance` counts as zero.
     """
-    n, d = len(poses), poses.shape[1] - 1
-    X = poses[:, :d]
-    spectrum, rank, gradient, bound, solved = graph.lifted_spectrum(X), d, np.inf, 0.0, False
+    n, d = len(X), X.shape[1]
+    spectrum, rank, gradient, bound, solved = graph.spectrum(X), d, np.inf, 0.0, False
     while not solved and rank < d + _LEVELS and np.isfinite(spectrum.proven):
-        if graph.bytes_of(_tangent(d, rank + 1)) > FACTOR_MAX_BYTES:
+        if graph.bytes_of(tangent(d, rank + 1)) > FACTOR_MAX_BYTES:
             break
         lifted = _lifted(graph, X, spectrum.direction)
         if lifted is None:
             break
-        X, gradient = _minimise(graph, lifted)
+        X, gradient = minimise(graph, lifted)
         rank += 1
-        spectrum = graph.lifted_spectrum(X)
-        bound = max(graph.lifted_value(X) - n * d * spectrum.proven, bound)
+        spectrum = graph.spectrum(X)
+        bound = max(graph.value(X) - n * d * spectrum.proven, bound)
         solved = spectrum.proven <= max(tolerance, 10.0 * spectrum.rounding)
-    return Climb(graph.minimise(_rounded(X, labels)), rank, solved, bound, gradient)
+    return Climb(minimise(graph, _rounded(X, labels))[0], rank, solved, bound, gradient)
 
 
-def _tangent(d: int, r: int) -> int:
+def tangent(d: int, r: int) -> int:
     """Return the dimension of tangents at [R t] in r dimensions: of R, which has d orthonormal columns, and of t."""
     return r * d - d * (d + 1) // 2 + r
 
@@ -74,10 +74,10 @@ def _lifted(graph: IsotropicGraph, X: Array, direction: Array) -> Array | None:
     flat = np.concatenate([X, np.zeros((n, 1, columns))], axis=1)
     step = np.zeros_like(flat)
     step[:, r] = direction / largest
-    best, best_cost, length = None, graph.lifted_value(X), 2.0
+    best, best_cost, length = None, graph.value(X), 2.0
     for _ in range(_HALVINGS):
         moved = _retracted(flat + length * step)
-        cost = graph.lifted_value(moved)
+        cost = graph.value(moved)
         if cost < best_cost:
             best, best_cost = moved, cost
         elif best is not None:
@@ -86,28 +86,30 @@ def _lifted(graph: IsotropicGraph, X: Array, direction: Array) -> Array | None:
     return best
 
 
-def _minimise(graph: IsotropicGraph, X: Array) -> tuple[Array, float]:
+def minimise(graph: IsotropicGraph, X: Array) -> tuple[Array, float]:
     """Return the minimum that damped Newton steps reach from X [N, r, d + 1], and the norm of the gradient there."""
     r, d = X.shape[1], X.shape[2] - 1
-    cost, damping, factor = graph.lifted_value(X), _LEAST_DAMPING, graph.factor(_tangent(d, r))
-    slope = np.inf
+    cost, damping, factor = graph.value(X), _LEAST_DAMPING, graph.factor(tangent(d, r))
+    slope = promised = np.inf
     for _ in range(_STEPS):
         basis, force = _basis(X), graph.force(X)
         gradient = np.einsum("nkab,nab->nk", basis, force)
         slope = float(np.linalg.norm(gradient))
-        own, off, scale = graph.curvature(X, force, basis)
-        diagonal = np.arange(own.shape[1])
+        is_ready = r == d and promised <= _NEAR * cost  # by the step before, whose basis turned with the poses
+        if not is_ready:
+            own, off, scale = graph.curvature(X, force, basis)
+            diagonal = np.arange(own.shape[1])
         while True:
             damped = own.copy()
             damped[:, diagonal, diagonal] += damping * scale
-            if factor.factorise(damped, off):
+            if is_ready or factor.factorise(damped, off):
                 step = factor.solve(-gradient)
                 promised = -float(np.vdot(gradient, step))
                 moved = _retracted(X + np.einsum("nk,nkab->nab", step, basis))
-                moved_cost = graph.lifted_value(moved)
+                moved_cost = graph.value(moved)
                 if moved_cost <= cost or promised < _CONVERGED * cost:
                     break
-            damping *= 10.0
+            damping, is_ready = 10.0 * damping, False
             if damping > _MAX_DAMPING:
                 return X, slope
         if moved_cost <= cost:
@@ -123,8 +125,8 @@ def _basis(X: Array) -> Array:
     n, r, columns = X.shape
     d = columns - 1
     Y = X[:, :, :d]
-    beside = np.linalg.qr(Y, mode="complete")[0][:, :, d:]
-    out = np.zeros((n, _tangent(d, r), r, columns))
+    beside = np.linalg.qr(Y, mode="complete")[0][:, :, d:] if r > d else Y[:, :, d:]
+    out = np.zeros((n, tangent(d, r), r, columns))
     k = 0
     for a in range(d):
         for b in range(a):
@@ -140,17 +142,20 @@ def _basis(X: Array) -> Array:
 
 
 def _retracted(X: Array) -> Array:
-    """Return X [N, r, d + 1] with the nearest orthonormal columns for those of the rotations."""
+    """Return X [N, r, d + 1] with the nearest orthonormal columns for those of the rotations.
+
+    Along a tangent, where r = d, rotations stay rotations: I + W has a positive determinant for any W = -W^T.
+    """
     d = X.shape[2] - 1
     U, _, Vt = np.linalg.svd(X[:, :, :d], full_matrices=False)
     return np.concatenate([U @ Vt, X[:, :, d:]], axis=2)
 
 
 def _rounded(X: Array, labels: Ids) -> Array:
-    """Return the poses [N, d + 1, d + 1] nearest to X [N, r, d + 1], of each part in the d dimensions it fills most."""
+    """Return the poses [N, d, d + 1] nearest to X [N, r, d + 1], of each part in the d dimensions it fills most."""
     n, _, columns = X.shape
     d = columns - 1
-    out = np.tile(np.eye(columns), (n, 1, 1))
+    out = np.empty((n, d, columns))
     for part in range(int(labels.max()) + 1):
         at = labels == part
         Y = X[at, :, :d]
@@ -159,5 +164,5 @@ def _rounded(X: Array, labels: Ids) -> Array:
             axes[:, 0] *= -1.0
         U, _, Vt = np.linalg.svd(axes.T @ Y)
         U[:, :, -1] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-        out[at, :d, :d], out[at, :d, d] = U @ Vt, X[at, :, d] @ axes
+        out[at, :, :d], out[at, :, d] = U @ Vt, X[at, :, d] @ axes
     return out

@@ -15,15 +15,15 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
+from vislam.batch.posegraph.arithmetic import retract_2d, retract_3d
 from vislam.batch.posegraph.g2o import write_g2o
 from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
+from vislam.batch.posegraph.starts import odometry_start
 from vislam.config import GraphWorldConfig
 from vislam.core.errors import UsageError
 from vislam.core.files import write_text
 from vislam.core.geometry import invert_many
-from vislam.core.jit import njit
 from vislam.core.messages import Array
 from vislam.trajectory import Trajectory, write_tum
 
@@ -72,13 +72,14 @@ def measured_graph(truth: Array, loops: Ids, world: GraphWorldConfig, rng: np.ra
     problem = PoseGraphProblem(
         dimension=d,
         ids=np.arange(len(truth)),
-        poses=_chained(truth[0], measured[: len(odometry)]),
+        poses=np.concatenate([truth[:1], np.full_like(truth[1:], np.nan)]),
         fixed=np.zeros(len(truth), dtype=bool),
         edges=np.ascontiguousarray(edges[order]),
         measurements=np.ascontiguousarray(measured[order]),
         information=np.tile(np.diag(sigma**-2.0), (len(edges), 1, 1)),
     )
-    return SimulatedGraph(problem, truth, kind[order] == 2)
+    chained = problem.with_poses(odometry_start(problem, problem.anchors()))
+    return SimulatedGraph(chained, truth, kind[order] == 2)
 
 
 def write_simulated(graph: SimulatedGraph, out: Path, truth: Path | None = None, outliers: Path | None = None) -> None:
@@ -124,28 +125,9 @@ def _sigmas(world: GraphWorldConfig, d: int) -> Array:
 
 def _pose(xi: Array, d: int) -> Array:
     """Return the poses [M, d + 1, d + 1] with the logarithms xi [M, k]."""
-    w, v = np.zeros((len(xi), 3)), np.zeros((len(xi), 3))
-    w[:, [2] if d == 2 else [0, 1, 2]], v[:, :d] = xi[:, :-d], xi[:, -d:]
-    angle2 = np.einsum("ni,ni->n", w, w)[:, None]
-    small = angle2 < 1e-8
-    safe = np.sqrt(np.where(small, 1.0, angle2))
-    first = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (safe - np.sin(safe)) / safe**3)
-    turned = np.cross(w, v)
-    T = np.zeros((len(xi), d + 1, d + 1))
-    T[:, :d, :d] = Rotation.from_rotvec(w).as_matrix()[:, :d, :d]
-    T[:, :d, d] = (v + first * turned + second * np.cross(w, turned))[:, :d]  # Barfoot 7.86
-    T[:, d, d] = 1.0
-    return T
-
-
-@njit(cache=True)
-def _chained(T: Array, steps: Array) -> Array:
-    """Return the poses [N + 1, d + 1, d + 1] that steps [N, d + 1, d + 1] lead to from T."""
-    out = np.empty((len(steps) + 1, *T.shape))
-    out[0] = T
-    for i in range(len(steps)):
-        out[i + 1] = out[i] @ steps[i]
+    still = np.tile(np.eye(d + 1), (len(xi), 1, 1))
+    out = np.empty_like(still)
+    (retract_2d if d == 2 else retract_3d)(still, np.arange(len(xi)), xi, out)
     return out
 
 

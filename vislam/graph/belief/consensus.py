@@ -23,20 +23,18 @@ from vislam.core.geometry import invert
 from vislam.core.messages import Array
 from vislam.factors.keys import X, nearest_rigid
 from vislam.factors.loop import LoopModel, relative_covariance
+from vislam.factors.loop_evidence import APART, LADDER, SOUND, innovation, log_volume
 from vislam.factors.motion import GAUGE_SIGMA
 from vislam.factors.noise_models import gaussian
-from vislam.factors.solvers import FAILURES, Factorization, IncrementalSolver
+from vislam.factors.solvers import FAILURES, Factorization, IncrementalSolver, graph_of
 from vislam.factors.visual import pose_factor
-from vislam.graph.belief.witnesses import Witnesses, confirming, log_volume
+from vislam.graph.belief.witnesses import EXPECTED, Witnesses, confirming
 from vislam.graph.travel import Chain, Travel
 
 _REVIEW_LOOPS = 20  # loops after which all are weighed again, if any was kept out; ...
 _REVIEW_DOUBTS = 3  # ... or loops kept out, after which they are
 _REVIEW_STEPS = 4  # of a review's work per keyframe: joint marginals of a small graph, 1 to 3 ms each
-_LADDER = (11.0, 7.0, 3.0)  # evidence that a witness could give, in nats: those of the first rung are asked first
-_EXPECTED = 3.0  # half the chi-square of six degrees of freedom, what a true loop loses of it
 _SCALES = (2.0, 4.0, 8.0)  # on the sigmas of odometry, tried where these seem to be too small
-_MARGIN = 10.0  # nats by which another hypothesis must be better
 _NODES = 16  # keyframes of the small graph that count as one step of work
 _RATIO_MAX = 1e9  # eigenvalues of a covariance summed along the run
 
@@ -182,7 +180,7 @@ def review(case: Case, trusted: dict[int, float], lost: set[int], scales: Iterab
     if best is None:
         return None
     speakers = case.speakers
-    found = confirming([speakers[n] for n in best.refused], case.chain, _LADDER[0], log_volume(case.chain))
+    found = confirming([speakers[n] for n in best.refused], case.chain)
     group = [best.refused[n] for n in found]
     yield
     if not group or lost.issuperset(group):
@@ -190,7 +188,7 @@ def review(case: Case, trusted: dict[int, float], lost: set[int], scales: Iterab
     rivals = [(1.0, group), *((scale, []) for scale in scales)]
     for scale, first in rivals:
         rival = yield from _believe(case, scale, first=first)
-        if rival is not None and rival.score > best.score + _MARGIN:
+        if rival is not None and rival.score > best.score + APART:
             best = rival
     return best
 
@@ -207,7 +205,7 @@ def _believe(case: Case, scale: float, trusted: dict[int, float] | None = None, 
 
 
 def _climb(case: Case, graph: _SmallGraph, scale: float, trusted: dict[int, float], first: Sequence[int]) -> Steps:
-    speakers, volume = case.speakers, log_volume(case.chain)
+    speakers, volume = case.speakers, log_volume(case.chain.poses[:, :3, 3])
     yield from graph.build({k for m in speakers for k in _ends(m)})
     kept, refused = dict(trusted), dict[int, float]()
     graph.take([speakers[n] for n in trusted])
@@ -219,13 +217,13 @@ def _climb(case: Case, graph: _SmallGraph, scale: float, trusted: dict[int, floa
     waiting = [n for n in range(len(speakers)) if n not in kept]
     alone = {n: _density(speakers[n], *case.chain.motion(*_ends(speakers[n])), scale) for n in waiting}
     waiting.sort(key=lambda n: 0.5 * alone[n][0] - alone[n][1])
-    rung = 0
-    while waiting and rung < len(_LADDER):
+    rung, rungs = 0, [least for least in LADDER if least >= SOUND]
+    while waiting and rung < len(rungs):
         later, before = [], len(kept)
         for n in waiting:
             chi2, log_density = graph.test(speakers[n])
             yield
-            if volume + log_density - _EXPECTED < _LADDER[rung]:
+            if volume + log_density - EXPECTED < rungs[rung]:  # what it could say is too little yet
                 later.append(n)
             elif chi2 <= speakers[n].threshold:
                 graph.take([speakers[n]])
@@ -274,9 +272,8 @@ def _ends(loop: LoopModel) -> tuple[int, int]:
 def _density(loop: LoopModel, T_from_to: Array, covariance: Array, scale: float = 1.0) -> tuple[float, float]:
     """Return the chi-square of a loop's innovation, for a relative pose so well known, and its log density at zero."""
     S = loop.covariance + scale**2 * covariance
-    residual, _ = loop.residual(np.eye(4), T_from_to)
-    _, log_determinant = np.linalg.slogdet(2.0 * np.pi * S)
-    return float(residual @ np.linalg.solve(S, residual)), float(-0.5 * log_determinant)
+    chi2, log_density = innovation(loop.residual(np.eye(4), T_from_to)[0], S)
+    return float(chi2), float(log_density)
 
 
 class _SmallGraph:
@@ -294,21 +291,24 @@ class _SmallGraph:
 
     def build(self, touched: set[int]) -> Generator[None]:
         """Put keyframes into the graph."""
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        factors, values = list[gtsam.NonlinearFactor](), gtsam.Values()
         before = -1
         for count, k in enumerate(sorted(touched)):
             values.insert(X(k), gtsam.Pose3(self._chain.poses[k]))
             if before < 0:
                 gauge = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
-                factors.add(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(self._chain.poses[k]), gauge))
+                factors.append(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(self._chain.poses[k]), gauge))
             else:
-                T, covariance = self._chain.motion(before, k)
-                factors.add(pose_factor(X(before), X(k), T, gaussian(self._scale**2 * covariance, _RATIO_MAX)))
+                factors.append(self._odometry(before, k, *self._chain.motion(before, k)))
             before = k
             if count % _NODES == _NODES - 1:
                 yield
-        self._solver.update(factors, values, [])
+        self._solver.update(graph_of(factors), values, [])
         self._nodes = sorted(touched)
+
+    def _odometry(self, a: int, b: int, T_a_b: Array, covariance: Array) -> gtsam.BetweenFactorPose3:
+        """Return the factor of odometry summed up from keyframe a to b."""
+        return pose_factor(X(a), X(b), T_a_b, gaussian(self._scale**2 * covariance, _RATIO_MAX))
 
     def _reach(self, loops: Sequence[LoopModel]) -> None:
         """Put the ends of loops into the graph where they are not."""
@@ -316,11 +316,10 @@ class _SmallGraph:
             nearest = min(self._nodes, key=lambda n: abs(n - k))
             a, b = min(nearest, k), max(nearest, k)
             T, covariance = self._chain.motion(a, b)
-            factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-            factors.add(pose_factor(X(a), X(b), T, gaussian(self._scale**2 * covariance, _RATIO_MAX)))
+            factor, values = self._odometry(a, b, T, covariance), gtsam.Values()
             T_map_nearest = self._solver.estimate([X(nearest)]).atPose3(X(nearest)).matrix()
             values.insert(X(k), gtsam.Pose3(nearest_rigid(T_map_nearest @ (T if k == b else invert(T)))))
-            self._solver.update(factors, values, [])
+            self._solver.update(graph_of([factor]), values, [])
             insort(self._nodes, k)
 
     def test(self, loop: LoopModel) -> tuple[float, float]:
@@ -336,10 +335,8 @@ class _SmallGraph:
         """Put loops into the graph."""
         if not loops:
             return
-        factors = gtsam.NonlinearFactorGraph()
-        for loop in loops:
-            factors.add(loop.factor(robust=False, as_measured=True))
-        slots = self._solver.update(factors, gtsam.Values(), [])
+        factors = [loop.factor(robust=False, as_measured=True) for loop in loops]
+        slots = self._solver.update(graph_of(factors), gtsam.Values(), [])
         self._slots |= {loop.id: slot for loop, slot in zip(loops, slots, strict=True)}
         self._solver.iterate(1)
 

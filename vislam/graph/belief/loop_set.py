@@ -11,7 +11,7 @@ from vislam.core.messages import Array, LoopDecision, LoopEdge
 from vislam.factors.journal import loop_record
 from vislam.factors.loop import LoopModel
 from vislam.graph.belief.consensus import Consensus, Verdict
-from vislam.graph.belief.gate import Anchors, Gate, PendingLoops
+from vislam.graph.belief.gate import Anchors, Gate
 from vislam.graph.belief.held import HeldLoops, LoopReports
 from vislam.graph.belief.known import Known, worth_a_factor
 from vislam.graph.estimator import Estimator
@@ -125,7 +125,7 @@ class LoopSet:
         self._held = HeldLoops(config, estimator)
         self.ledger = LoopReports()
         self.gate = Gate(estimator, travel, self._held, self.ledger)
-        self._pending = PendingLoops(config)
+        self._pending: dict[int, LoopModel] = {}  # that wait outside the gate, by id, oldest first
         self._anchors = Anchors(config, estimator)
         self._exchange = Exchange(estimator, self._held, self.gate, self._anchors, self.ledger)
         self._consensus = Consensus(config)
@@ -136,7 +136,7 @@ class LoopSet:
     @property
     def pending(self) -> int:
         """Return how many loops are pending."""
-        return len(self._pending.edges)
+        return len(self._pending)
 
     @property
     def held(self) -> list[LoopModel]:
@@ -150,7 +150,7 @@ class LoopSet:
 
     def take_states(self, waiting: Sequence[LoopModel]) -> tuple[LoopState, ...]:
         """Return where the loops are now that were decided about since the last call; some wait elsewhere."""
-        apart = {model.record.id: LoopPlace.PENDING for model in self._pending.edges}
+        apart = dict.fromkeys(self._pending, LoopPlace.PENDING)
         apart |= {model.record.id: LoopPlace.WAITING for model in waiting}
         apart |= dict.fromkeys(self._undone, LoopPlace.UNDONE)
         return tuple(self._loop_state(n, apart) for n in self.ledger.take_changed())
@@ -170,8 +170,7 @@ class LoopSet:
         self.ledger.restore(loops)
         for tied in ties:
             self._anchors.tie(tied)
-        for model in by_place[LoopPlace.PENDING]:
-            self._pending.add(model)
+        self.keep_pending(by_place[LoopPlace.PENDING])
         self._undone = {model.id for model in by_place[LoopPlace.UNDONE]}
         apart = {model.id for place in (LoopPlace.WAITING, LoopPlace.UNDONE) for model in by_place[place]}
         for model in (m for m in models if m.id not in apart):
@@ -203,10 +202,13 @@ class LoopSet:
 
     def keep_pending(self, models: Sequence[LoopModel]) -> list[int]:
         """Keep loops pending that do not fit; return the ids of those that had to leave for them."""
-        gone = [evicted for model in models if (evicted := self._pending.add(model)) is not None]
-        for model in gone:
-            self.ledger.add(model, LoopDecision.REJECTED, "left the full list of pending loops")
-        return [model.record.id for model in gone]
+        gone = []
+        for model in models:
+            self._pending[model.id] = model
+            if len(self._pending) > self._config.pending_max:
+                gone.append(self._pending.pop(next(iter(self._pending))))
+                self.ledger.add(gone[-1], LoopDecision.REJECTED, "left the full list of pending loops")
+        return [model.id for model in gone]
 
     def undo(self, loop_ids: Sequence[int], notes: list[str]) -> list[int]:
         """Take loops out for good, as far as the graph holds them; return the ids of those."""
@@ -324,7 +326,8 @@ class LoopSet:
         if verdict.scale > 1.0 and back:  # several witnesses show that odometry's sigmas are too small
             estimator.distrust_odometry(verdict.scale)
             self._travel.scale(verdict.scale)
-        self._pending.remove(back)
+        for model in back:
+            self._pending.pop(model.id, None)
         if out or verdict.scale > 1.0 or not self._exchange.let_in(back, notes):
             self._exchange.rebuild(out, back, notes)
         torn = self._judge(back, f"let in at keyframe {newest}: it agrees with {verdict.places} places", True)

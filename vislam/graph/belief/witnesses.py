@@ -12,13 +12,14 @@ from vislam.core.angles import angles_of
 from vislam.core.chi_square import chi_square_limit
 from vislam.core.geometry import invert, invert_many, so3_log
 from vislam.factors.loop import LoopModel
+from vislam.factors.loop_evidence import LADDER, PLACE, log_volume
 from vislam.graph.travel import Chain, Travel
 
-_WITNESS_KEYFRAMES = 10  # loops that start and end so near to another's, or ...
-_WITNESS_M = 1.0  # ... whose ends lie so near to its ends ...
+_WITNESS_M = 1.0  # loops that start and end at the places of another's, or whose ends lie so near to its ends ...
 _WITNESS_DEG = 45.0  # ... looking the same way, see the same things: together they are one witness
 # on odometry sigma, for whether two loops of one witness say the same; 3 mixed them
 _WITNESS_INFLATION = 1.5
+EXPECTED = 3.0  # half the chi-square of six degrees of freedom, what a true loop loses of its evidence
 _SEEDS = 5  # loops with most friends, around which the largest group is looked for
 
 
@@ -58,7 +59,7 @@ class Witnesses:
         """Return which witnesses [W] are about the same two places: few keyframes apart, or next to one another."""
         poses = travel.poses
         known = self._ends[: len(self)]
-        close = np.abs(known - ends) <= _WITNESS_KEYFRAMES
+        close = np.abs(known - ends) <= PLACE
         moved = np.linalg.norm(poses[known, :3, 3] - poses[ends, :3, 3], axis=2)
         cosine = (np.einsum("wnij,nij->wn", poses[known, :3, :3], poses[ends, :3, :3]) - 1.0) / 2.0
         close |= (moved < _WITNESS_M) & (cosine > np.cos(np.deg2rad(_WITNESS_DEG)))
@@ -83,16 +84,17 @@ class Witnesses:
         return float(turn @ turn) / rad2 + float(cycle[:3, 3] @ cycle[:3, 3]) / m2
 
 
-def confirming(loops: Sequence[LoopModel], chain: Chain, evidence_min: float, log_volume: float) -> list[int]:
+def confirming(loops: Sequence[LoopModel], chain: Chain) -> list[int]:
     """Return the largest group found of loops that confirm one another through odometry alone, as indices.
 
     Two confirm one another when they close a cycle that would hardly close by chance: its covariance is small against
-    the volume of relative poses that a false loop may claim, by e^`evidence_min`. Pairwise consistency as by Mangelson
-    et al., "Pairwise Consistent Measurement Set Maximization", ICRA 2018, with variances summed along the run.
+    the volume of relative poses that a false loop may claim, by the highest rung of evidence. Pairwise consistency as
+    by Mangelson et al., "Pairwise Consistent Measurement Set Maximization", ICRA 2018, with variances summed along the
+    run.
     """
     if len(loops) < 2:
         return []
-    limit = chi_square_limit(0.999, 6)
+    limit, volume = chi_square_limit(0.999, 6), log_volume(chain.poses[:, :3, 3])
     a, b = (np.array([getattr(m.record, end) for m in loops]) for end in ("from_id", "to_id"))
     Z = np.stack([m.record.T_from_to for m in loops])
     own = np.array([[np.trace(m.covariance[:3, :3]), np.trace(m.covariance[3:, 3:])] for m in loops]) / 3.0
@@ -109,8 +111,8 @@ def confirming(loops: Sequence[LoopModel], chain: Chain, evidence_min: float, lo
         )
         m2 = m2 + rad2 * lever**2 / 3.0
         d2 = angles_of(cycle[:, :3, :3]) ** 2 / rad2 + np.sum(cycle[:, :3, 3] ** 2, axis=1) / m2
-        evidence = log_volume - 1.5 * (np.log(rad2) + np.log(m2)) - 3.0 * np.log(2.0 * np.pi) - 3.0
-        agree[n] = (d2 < limit) & (evidence > evidence_min)
+        evidence = volume - 1.5 * (np.log(rad2) + np.log(m2)) - 3.0 * np.log(2.0 * np.pi) - EXPECTED
+        agree[n] = (d2 < limit) & (evidence > LADDER[0])
         agree[n, n] = False
     best: list[int] = []
     for seed in np.argsort(-agree.sum(axis=1), kind="stable")[:_SEEDS].tolist():
@@ -124,12 +126,3 @@ def confirming(loops: Sequence[LoopModel], chain: Chain, evidence_min: float, lo
         if len(members) > max(len(best), 1):
             best = members
     return sorted(best)
-
-
-def log_volume(chain: Chain, room_m: float = 1.0) -> float:
-    """Return the logarithm of the volume, in rad^3 m^3, of the relative poses that a false loop may claim.
-
-    Anywhere in the space that the run has seen, with any heading, and tilted by up to half a radian.
-    """
-    extent = np.ptp(chain.poses[:, :3, 3], axis=0) + room_m
-    return float(np.sum(np.log(extent)) + np.log(2.0 * np.pi))

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from vislam.batch.bundle.loops import loop_edges
 from vislam.batch.posegraph.auto import decide
 from vislam.batch.posegraph.domains import Team
 from vislam.batch.posegraph.g2o import write_g2o
 from vislam.batch.posegraph.optimize import PoseGraphSolution, optimize_pose_graph
-from vislam.batch.posegraph.problem import PoseGraphProblem
+from vislam.batch.posegraph.problem import PoseGraphProblem, RelativePoses
 from vislam.batch.posegraph.uncertainty import Uncertainty
 from vislam.config import PoseGraphConfig
 from vislam.core.errors import TrackingLostError, UsageError
@@ -23,15 +24,7 @@ from vislam.core.progress import Progress, silent
 from vislam.factors import LoopModel, loop_record
 from vislam.graph.joining import JOIN_FRAMES, RelativeCovariance, Waiting
 from vislam.loop import LoopCloser
-from vislam.runs.offline.session_graph import (
-    Edges,
-    SessionPart,
-    loop_edges,
-    problem_of,
-    read_part,
-    together,
-    weak_links,
-)
+from vislam.runs.offline.session_graph import SessionPart, read_part
 from vislam.trajectory import Trajectory, write_tum
 
 
@@ -124,7 +117,7 @@ class _Search:
         counts = [len(part.poses) for part in parts]
         self.first_ids = np.concatenate([[0], np.cumsum(counts)[:-1]]).tolist()
         self.poses = np.concatenate([part.poses for part in parts])
-        self.edges = together(
+        self.edges = RelativePoses.joined(
             [replace(p.edges, ends=p.edges.ends + first) for p, first in zip(parts, self.first_ids, strict=True)]
         )
         self.submaps = Submaps()
@@ -207,18 +200,14 @@ class _Search:
 
     def _knowledge(self, placing: list[LoopModel]) -> RelativeCovariance:
         """Return how well the motion between two keyframes is known by odometry, the sessions' loops and `placing`."""
-        edges = together([self.edges, self.as_edges(placing)])
-        uncertainty = Uncertainty(problem_of(self.poses, edges), self.poses)
+        edges = RelativePoses.joined([self.edges, loop_edges(placing, self.poses)])
+        uncertainty = Uncertainty(edges.problem(self.poses), self.poses)
 
         @cache
         def known(i: int, j: int) -> Array:
             return np.asarray(uncertainty.relative(np.array([[i, j]]))[0])
 
         return known
-
-    def as_edges(self, models: list[LoopModel]) -> Edges:
-        """Return loops as edges; the poses lend length to those without scale."""
-        return loop_edges([m.record for m in models], self.poses, self._graph, self.lever_m)
 
 
 def _optimised(
@@ -227,11 +216,11 @@ def _optimised(
     """Judge the loops between sessions and optimise everything in the frame of the first."""
     suspects = [m for m in models if search.submaps.are_joined(m.record.from_id, m.record.to_id)]
     _check_joined(parts, search, suspects, len(models))
-    edges = together([search.edges, search.as_edges(suspects)])
-    for k in weak_links(search.submaps):  # nothing was measured: they say what the placed submaps say
+    edges = RelativePoses.joined([search.edges, loop_edges(suspects, search.poses)])
+    for k in filter(None, search.submaps.first_ids):  # nothing was measured before: they say what placed submaps say
         at = np.flatnonzero(np.all(search.edges.ends == (k - 1, k), axis=1))
         edges.T_from_to[at] = invert(search.poses[k - 1]) @ search.poses[k]
-    problem = problem_of(search.poses, edges)
+    problem = edges.problem(search.poses)
     is_suspect = np.arange(len(edges.ends)) >= len(search.edges.ends)
     decision = decide(problem, PoseGraphConfig(), doubtful=is_suspect)
     weights, kept = decision.weights, decision.weights[is_suspect] > 0.0

@@ -7,37 +7,26 @@ from typing import Any
 import numpy as np
 
 from vislam.batch.bundle.chain import Chain
-from vislam.batch.bundle.loops import UNSCALED_ODOMETRY_SIGMA, loop_factor
-from vislam.batch.posegraph.problem import Ids, PoseGraphProblem
-from vislam.config import Config, GraphConfig
+from vislam.batch.bundle.loops import loop_edges
+from vislam.batch.posegraph.problem import RelativePoses
+from vislam.config import Config
 from vislam.core.camera import Rig
 from vislam.core.errors import DataError
 from vislam.core.geometry import invert
 from vislam.core.memory import LoopPlace, SlamMemory
 from vislam.core.messages import Array, Submaps
 from vislam.factors import (
-    FactorLog,
-    LoopRecord,
+    LoopModel,
     WindowOdometry,
     checked_covariance,
     checked_pose,
     conditioned,
     loop_record,
-    measurement_of,
 )
 from vislam.runs.session import Session, recall
 from vislam.trajectory.frames import LoggedFrames
 
 _HELD = (LoopPlace.GRAPH, LoopPlace.SPARE)  # where accepted loops are
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Edges:
-    """Relative poses between keyframes, tangents as in `PoseGraphProblem`."""
-
-    ends: Ids  # [E, 2]
-    T_from_to: Array  # [E, 4, 4]
-    information: Array  # [E, 6, 6]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +42,7 @@ class SessionPart:
     frames: LoggedFrames
     first_id: int  # the first keyframe of its own recording
     submaps: Submaps  # joined as its loops join them
-    edges: Edges  # odometry, then loops
+    edges: RelativePoses  # odometry, then loops
 
     @property
     def has_gravity(self) -> bool:
@@ -85,53 +74,17 @@ def read_part(path: Path, name: str) -> SessionPart:
         submaps = submaps.begun(k)
     records = [loop_record(o.edge, len(packets) - 1) for o in memory.graph.loops if o.state.place in _HELD]
     submaps = submaps.joined_by((r.from_id, r.to_id) for r in records)
-    odometry = _of_window(memory, config, begins) if memory.graph.windows else _of_chain(log, config)
-    poses, lever_m = memory.graph.T_map_body, log.rig.T_body_cam0[:3, 3]
-    steps = [(k - 1, k) for k in range(1, len(packets))]
-    edges = together([edges_of(steps, odometry), loop_edges(records, poses, config.graph, lever_m)])
+    if memory.graph.windows:
+        odometry = _of_window(memory, config, begins)
+    else:
+        odometry = Chain(log, config.graph, config.machine).odometry()  # loose coupling has no window
+    models = [LoopModel(record, config.graph, log.rig.T_body_cam0[:3, 3]) for record in records]
+    edges = RelativePoses.joined([odometry, loop_edges(models, memory.graph.T_map_body)])
     return SessionPart(path, name, config, rig, log.rig, memory, log.frames, first_id, submaps, edges)
 
 
-def edges_of(ends: list[tuple[int, int]], measured: list[tuple[Array, Array]]) -> Edges:
-    """Return the edges of ends and measurements with their information."""
-    return Edges(
-        np.array(ends, dtype=np.int64).reshape(-1, 2),
-        np.array([T for T, _ in measured], dtype=np.float64).reshape(-1, 4, 4),
-        np.array([information for _, information in measured], dtype=np.float64).reshape(-1, 6, 6),
-    )
-
-
-def loop_edges(records: list[LoopRecord], poses: Array, config: GraphConfig, lever_m: Array) -> Edges:
-    """Return loops as edges; see `loop_factor`."""
-    factors = [loop_factor(record, poses, config, lever_m, robust=False) for record in records]
-    return edges_of([(r.from_id, r.to_id) for r in records], [measurement_of(factor) for factor in factors])
-
-
-def weak_links(submaps: Submaps) -> list[int]:
-    """Return the keyframes before which nothing was measured."""
-    return [k for k in submaps.first_ids if k]
-
-
-def problem_of(poses: Array, edges: Edges) -> PoseGraphProblem:
-    """Return the pose graph of keyframes 0..M-1 at poses [M, 4, 4]."""
-    count = len(poses)
-    return PoseGraphProblem(
-        3, np.arange(count), np.ascontiguousarray(poses), np.zeros(count, np.bool_), np.ascontiguousarray(edges.ends),
-        np.ascontiguousarray(edges.T_from_to), np.ascontiguousarray(edges.information),
-    )  # fmt: skip
-
-
-def together(parts: list[Edges]) -> Edges:
-    """Return edges one after another."""
-    return Edges(
-        np.concatenate([e.ends for e in parts]),
-        np.concatenate([e.T_from_to for e in parts]),
-        np.concatenate([e.information for e in parts]),
-    )
-
-
-def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> list[tuple[Array, Array]]:
-    """Return odometry and its information as the window of tight coupling summarised it."""
+def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> RelativePoses:
+    """Return odometry as the window of tight coupling summarised it."""
     odometry = WindowOdometry(config.graph, config.machine)
     for window in memory.graph.windows:
         odometry.append(window)
@@ -147,10 +100,4 @@ def _of_window(memory: SlamMemory, config: Config, begins: list[int]) -> list[tu
         measured = invert(poses[k - 1]) @ poses[k] if k in begins else edge.T_previous_body
         T = checked_pose(measured, what)
         out.append((T, np.asarray(np.linalg.inv(covariance))))
-    return out
-
-
-def _of_chain(log: FactorLog, config: Config) -> list[tuple[Array, Array]]:
-    """Return odometry and its information as vision measured it: loose coupling has no window."""
-    factors = Chain(log, config.graph, config.machine).odometry_edges(UNSCALED_ODOMETRY_SIGMA)
-    return [measurement_of(factor) for factor in factors]
+    return RelativePoses.of([(k - 1, k) for k in range(1, len(poses))], out)
