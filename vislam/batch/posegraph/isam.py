@@ -50,6 +50,7 @@ _SEEN = LANDMARK_COLUMNS | BEARING_RANGE_COLUMNS
 _COLUMNS = dict.fromkeys(_EDGES_2D, (2, 9)) | {"EDGE3": (2, 27), "POSE3D_INIT": (1, 6)} | _SEEN
 _MAX_ID = 2**63 - 1
 _UPRIGHT = 1e-6  # cosine of the pitch
+_NO_PIVOT = 1e-7  # of the largest of a square root: below, information is singular
 
 
 def read_isam(path: Path, repair: bool = False, noise: Noise | Literal["auto"] = "auto") -> PoseGraphProblem:
@@ -125,6 +126,9 @@ def write_isam(problem: PoseGraphProblem, path: Path, poses: Array | None = None
     inverse = np.linalg.inv(J)
     try:
         R = np.linalg.cholesky(inverse.transpose(0, 2, 1) @ problem.information @ inverse).transpose(0, 2, 1)
+        pivots = np.diagonal(R, axis1=1, axis2=2)
+        if np.any(pivots.min(axis=1) <= _NO_PIVOT * pivots.max(axis=1)):  # by rounding above zero
+            raise np.linalg.LinAlgError
         places = list(landmark_lines(whole)) if seen.any() else []
     except np.linalg.LinAlgError as error:
         raise UsageError(
