@@ -35,7 +35,7 @@ def room() -> SceneBuilder:
     floor(world, (-3.0, -2.0), (3.0, 2.0), paint.concrete(), 60.0)
     ceiling(world, (-3.0, -2.0), (3.0, 2.0), 2.5, paint.plaster((200, 200, 200)), 40.0)
     world.box((1.5, 0.8), 0.0, (0.8, 0.6, 1.1), 0.5, paint.wood(), texels_per_m=80.0)
-    world.cylinder((1.2, -0.7), 0.3, 0.35, 0.9, paint.tiles((90, 120, 200), 0.1), texels_per_m=80.0)
+    world.cylinder((1.2, -0.7), 0.3, 0.35, 0.9, paint.tiles((90, 120, 200), 0.1, 0.06), texels_per_m=80.0)
     world.lamp((0.0, 0.0, 2.3), 3.0, (1.0, 1.0, 1.0))
     return world
 
