@@ -115,7 +115,7 @@ class IsotropicGraph:
         own = plain - multiplied.reshape(n, k, -1) @ flat.transpose(0, 2, 1)
         own[self._pinned] += plain[self._pinned]
         start, end = basis[self._edges[:, 0]], flat[self._edges[:, 1]]
-        off = (start @ self._off[:, None]).reshape(len(end), k, -1) @ end.transpose(0, 2, 1)
+        off = (start @ self._off[:, None]).reshape(end.shape) @ end.transpose(0, 2, 1)
         return np.ascontiguousarray(own), self._placed(off), np.einsum("nkk->nk", plain)
 
     def factor(self, k: int) -> Factor:
