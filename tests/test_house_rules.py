@@ -25,7 +25,7 @@ MOST_ATTRIBUTES = 20
 LONGEST_FILE, SHORTEST_FILE = 400, 30  # a shorter one that one file alone uses belongs to that one
 
 # Budgets: a commit that raises one says why. They are to fall to what stands beside them.
-BUDGET_PRODUCT_LINES = 123_104  # to 97,000
+BUDGET_PRODUCT_LINES = 123_105  # to 97,000
 BUDGET_TEST_LINES = 68_494  # to 49,000
 BUDGET_LONG_FILES = 12  # to 0
 BUDGET_WORDS = 43_214  # of README and docs/, as `wc -w` counts

@@ -169,6 +169,12 @@ def test_one_process_compiles_a_kernel_and_others_wait_while_it_lives(folder: Pa
     assert list(folder.rglob("*.compiling")) == []
 
 
+def test_where_files_cannot_be_locked_a_kernel_is_compiled_at_once(folder: Path) -> None:
+    refused = "import errno, fcntl, time\ndef refuse(*_): raise OSError(errno.ENOLCK, '')\nfcntl.flock = refuse\n"
+    script = ASK.format(kernel="half", arguments="3.0").replace("import", f"{refused}time.sleep = None\nimport", 1)
+    assert _ask(folder, script)[:2] == ["1.5", "0"]
+
+
 REPLACED = {  # SHA-256 of their code in numba 0.68, without comments and docstrings
     "_unserialize": "161c0d9a4935aa36",
     "_get_module_for_linking": "5053a3ac7254fae6",

@@ -41,18 +41,19 @@ class CacheInTurns(FunctionCache):  # type: ignore[misc]
         return Path(self._cache_path, f"{self._impl.filename_base}.compiling")
 
     def _take_turn(self) -> bool:
-        """Wait until no other process compiles this kernel; False where that cannot be known."""
+        """Wait until no other process compiles this kernel; False where that cannot be known, or takes too long."""
+        turn, latest_s = -1, time.monotonic() + _LONGEST_S
         try:
             self._impl.locator.ensure_cache_path()
             turn = os.open(self._place(), os.O_CREAT | os.O_RDWR, 0o600)
-        except OSError:
-            return False
-        latest_s = time.monotonic() + _LONGEST_S
-        while not _is_locked(turn):
-            if time.monotonic() > latest_s:
+            while not _is_locked(turn):
+                if time.monotonic() > latest_s:
+                    raise TimeoutError
+                time.sleep(_POLL_S)
+        except OSError:  # also of file systems without locks
+            if turn >= 0:
                 os.close(turn)
-                return False
-            time.sleep(_POLL_S)
+            return False
         self._turn = turn
         return True
 
@@ -66,6 +67,6 @@ class CacheInTurns(FunctionCache):  # type: ignore[misc]
 def _is_locked(descriptor: int) -> bool:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return False
     return True
